@@ -1,0 +1,61 @@
+"""Guaranteed boxes for the state and the unknown input of a nonlinear system: a JAX-compiled batch interval observer."""
+
+from typing import TYPE_CHECKING, Any
+
+from gsisio_jax import estimation, inclusion
+from gsisio_jax.alarms import Alarm
+from gsisio_jax.certificate import Certificate
+from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
+from gsisio_jax.estimation import Estimate, estimate, start, step
+from gsisio_jax.interval import Interval, hull, intersect, linear_image
+from gsisio_jax.observer import Carry, Observer, StepOutput
+from gsisio_jax.status import Status
+from gsisio_jax.system import Noise, Simulation, System, simulate
+
+if TYPE_CHECKING:
+    from gsisio_jax import dataset, examples, plot
+    from gsisio_jax.design import design_observer
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Alarm",
+    "Carry",
+    "Certificate",
+    "Estimate",
+    "Interval",
+    "NoDesignFound",
+    "Noise",
+    "Observer",
+    "ObserverDoesNotExist",
+    "Simulation",
+    "Status",
+    "StepOutput",
+    "System",
+    "dataset",
+    "design_observer",
+    "estimate",
+    "estimation",
+    "examples",
+    "hull",
+    "inclusion",
+    "intersect",
+    "linear_image",
+    "plot",
+    "simulate",
+    "start",
+    "step",
+]
+
+_LAZY = {"design_observer": "gsisio_jax.design", "dataset": "", "examples": "", "plot": ""}
+
+
+def __getattr__(name: str) -> Any:
+    """Load on first use what an online run does not need: the solver, tables and pictures."""
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    if _LAZY[name]:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    return importlib.import_module(f"{__name__}.{name}")

@@ -1,0 +1,163 @@
+"""From the configuration to the library's objects, with every size checked against the system."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..interval import Interval
+from ..system import Noise, System
+from .config import Bounds, Config, Signal
+from .errors import UserError, reason
+
+
+@dataclass(frozen=True)
+class Names:
+    """Names and units of one group of signals, in order."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """All that the observer needs, apart from the measurements."""
+
+    system: Any
+    noise: Any
+    region: Any
+    u_region: Any
+    initial: Any
+    design: dict[str, Any]
+    state: Names
+    input: Names
+    output: Names
+    known_input: Names
+
+
+@contextlib.contextmanager
+def importable(folder: Path) -> Iterator[None]:
+    """Let modules that lie beside the configuration file be imported, as ``python script.py`` does."""
+    sys.path.insert(0, str(folder))
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ValueError):
+            sys.path.remove(str(folder))
+
+
+def resolve(reference: str, key: str) -> Any:
+    """Import what ``module:attribute`` names.
+
+    Raises:
+        UserError: the module cannot be imported, or has no such attribute.
+    """
+    module_name, _, attribute = reference.partition(":")
+    try:
+        found = importlib.import_module(module_name)
+    except Exception as error:
+        raise UserError(f"{key}: cannot import {module_name}: {type(error).__name__}: {reason(error)}") from error
+    for part in attribute.split("."):
+        if not hasattr(found, part):
+            raise UserError(f"{key}: {module_name} has no attribute {attribute}")
+        found = getattr(found, part)
+    return found
+
+
+def build_problem(config: Config, file: str) -> Problem:
+    """Build system, noise and boxes, and check every list of the file against the size of the system.
+
+    Args:
+        config: the configuration, read and checked by itself.
+        file: its name, for messages.
+
+    Raises:
+        UserError: the system cannot be made, or a list has the wrong length.
+    """
+    system = _system(config, file)
+    sizes = {"states": system.n, "inputs": system.p, "outputs": system.l, "known inputs": system.m}
+
+    def check(key: str, values: list, what: str, unit: str = "value") -> None:
+        if len(values) != sizes[what]:
+            plural = "" if len(values) == 1 else "s"
+            singular = what.removesuffix("s") if sizes[what] == 1 else what
+            raise UserError(
+                f"{file}: {key} has {len(values)} {unit}{plural}, the system has {sizes[what] or 'no'} {singular}"
+            )
+
+    def box(key: str, bounds: Bounds, what: str) -> Any:
+        if bounds.radius is not None:
+            check(f"{key}.radius", bounds.radius, what)
+            return Interval.symmetric(bounds.radius)
+        check(f"{key}.lower", bounds.lower or [], what)
+        return Interval(bounds.lower, bounds.upper)
+
+    def names(key: str, signals: list[Signal] | None, what: str, letter: str) -> Names:
+        if signals is None:
+            signals = [Signal(name=f"{letter}{index + 1}") for index in range(sizes[what])]
+        check(f"signals.{key}", signals, what, "name")
+        return Names(tuple(signal.name for signal in signals), tuple(signal.unit for signal in signals))
+
+    check("table.y", config.table.y, "outputs", "column")
+    check("table.u", config.table.u, "known inputs", "column")
+    if config.u_region is not None and system.m == 0:
+        raise UserError(f"{file}: u_region is given, the system has no known inputs")
+    if config.region.auto:
+        region: Any = "auto"
+    else:
+        region = box("region", Bounds(lower=config.region.lower, upper=config.region.upper), "states")
+    groups = {
+        "state": names("state", config.signals.state, "states", "x"),
+        "input": names("input", config.signals.input, "inputs", "d"),
+        "output": names("output", config.signals.output, "outputs", "y"),
+        "known_input": names("known_input", config.signals.known_input, "known inputs", "u"),
+    }
+    _check_unique(groups, file)
+    return Problem(
+        system=system,
+        noise=Noise(w=box("noise.w", config.noise.w, "states"), v=box("noise.v", config.noise.v, "outputs")),
+        region=region,
+        u_region=None if config.u_region is None else box("u_region", config.u_region, "known inputs"),
+        initial=box("initial", config.initial, "states"),
+        design=config.design.model_dump(exclude_none=True),
+        **groups,
+    )
+
+
+def _system(config: Config, file: str) -> Any:
+    reference, arguments = config.system.use, config.system.arguments
+    found = resolve(reference, f"{file}: system.use")
+    if not isinstance(found, System):
+        if not callable(found):
+            raise UserError(
+                f"{file}: system.use: {reference} must be a System or a function that returns one, "
+                f"got {type(found).__name__}"
+            )
+        try:
+            found = found(**arguments)
+        except Exception as error:
+            text = reason(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {reason(error)}"
+            raise UserError(f"{file}: system: {reference} failed: {text}") from error
+        if not isinstance(found, System):
+            raise UserError(f"{file}: system.use: {reference} returned {type(found).__name__}, not a System")
+    elif arguments:
+        raise UserError(f"{file}: system.arguments are given, but {reference} is a System and takes none")
+    return found
+
+
+def _check_unique(groups: dict[str, Names], file: str) -> None:
+    """Names become columns and variables, so no two may give the same one."""
+    taken: dict[str, str] = {name: "a column of every output" for name in ("time", "status", "margin")}
+    for group in ("state", "input", "output"):
+        for name in groups[group].names:
+            made = [f"measured_{name}"] if group == "output" else [f"{name}_lower", f"{name}_upper"]
+            for column in made:
+                if column in taken:
+                    raise UserError(f"{file}: signals.{group}: the name {name} is already used ({taken[column]})")
+                taken[column] = f"by {group} {name}"

@@ -1,0 +1,169 @@
+"""Labelled results: an estimate as an xarray Dataset with the user's own names and units.
+
+The command line writes this Dataset as NetCDF; anyone else can build it from any estimate with `to_dataset`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ._extras import need
+from .status import Status
+
+
+def to_dataset(
+    est: Any,
+    *,
+    time: Any = None,
+    state_names: Sequence[str] | None = None,
+    input_names: Sequence[str] | None = None,
+    output_names: Sequence[str] | None = None,
+    state_units: Sequence[str] | None = None,
+    input_units: Sequence[str] | None = None,
+    output_units: Sequence[str] | None = None,
+    y: Any = None,
+    title: str = "",
+    certificate: Any = None,
+) -> Any:
+    """Label an estimate.
+
+    Args:
+        est: result of `estimate` on one record (no batch axis): T steps, n states, p unknown inputs.
+        time: shape (T,), seconds; the step number where it is left out.
+        state_names: n names; ``x1, x2, ...`` where left out. Likewise `input_names` (``d1, ...``) and `output_names`
+            (``y1, ...``).
+        state_units: n units; no unit where left out. Likewise `input_units` and `output_units`.
+        y: shape (T, l), the measurements, NaN where missing; left out of the Dataset where left out here.
+        title: attribute ``title``.
+        certificate: the observer's certificate; its text becomes the attribute ``certificate``.
+
+    Returns:
+        ``xarray.Dataset`` with the dimension ``time``: ``<signal>_lower`` and ``<signal>_upper`` of every state and
+        input, ``measured_<output>``, ``status`` (a bit mask with CF flag attributes) and ``margin``. The input box at
+        step k is that of d_k, which needs y_{k+1}: its last entry is NaN. The attribute ``alarms`` is a JSON list of
+        ``{time, kind, index, gap, text}``.
+
+    Raises:
+        ValueError: a batch of estimates, or a list of the wrong length.
+        MissingExtra: xarray is not installed.
+    """
+    import gsisio_jax
+
+    xarray = need("xarray", extra="cli", purpose="a labelled dataset")
+    state_shape = np.shape(est.state.lower)
+    if len(state_shape) != 2:
+        raise ValueError(
+            f"to_dataset: `est` must hold one record, est.state of shape (T, n), got {state_shape}; take one element "
+            "of the batch first"
+        )
+    steps, n = state_shape
+    p = np.shape(est.input.lower)[-1]
+    time, time_attributes = _time(time, steps)
+    state_names, state_units = _labels("state", state_names, state_units, n, "x")
+    input_names, input_units = _labels("input", input_names, input_units, p, "d")
+    variables: dict[str, Any] = {}
+    for index, (name, unit) in enumerate(zip(state_names, state_units, strict=True)):
+        _add_bounds(variables, name, unit, "state", np.asarray(est.state.lower), np.asarray(est.state.upper), index)
+    last = np.full((1, p), np.nan)
+    lower, upper = (np.concatenate([np.asarray(side), last]) for side in (est.input.lower, est.input.upper))
+    for index, (name, unit) in enumerate(zip(input_names, input_units, strict=True)):
+        _add_bounds(variables, name, unit, "unknown input", lower, upper, index)
+    if y is not None:
+        y = np.asarray(y)
+        if y.ndim != 2 or len(y) != steps:
+            raise ValueError(f"to_dataset: `y` must have shape ({steps}, l), got {y.shape}")
+        output_names, output_units = _labels("output", output_names, output_units, y.shape[1], "y")
+        for index, (name, unit) in enumerate(zip(output_names, output_units, strict=True)):
+            attributes = {"units": unit, "long_name": f"measured {_spoken(name)}", "role": "output"}
+            variables[f"measured_{name}"] = ("time", y[:, index], attributes)
+    variables["status"] = ("time", np.asarray(est.status).astype(np.int32), _flags())
+    margin = {"long_name": "signed slack of the tightest intersection, in the unit of its component"}
+    variables["margin"] = ("time", np.asarray(est.margin), margin)
+    alarms = alarm_records(
+        est,
+        time,
+        state_names=state_names,
+        input_names=input_names,
+        output_names=output_names,
+        state_units=state_units,
+        input_units=input_units,
+        output_units=output_units,
+    )
+    attributes = {
+        "title": title,
+        "alarms": json.dumps(alarms, ensure_ascii=False),
+        "certificate": "" if certificate is None else str(certificate),
+        "library": f"gsisio_jax {gsisio_jax.__version__}",
+    }
+    return xarray.Dataset(variables, coords={"time": ("time", time, time_attributes)}, attrs=attributes)
+
+
+def alarm_records(est: Any, time: Any, **labels: Any) -> list[dict[str, Any]]:
+    """Alarms of an estimate as plain data.
+
+    Args:
+        est: an estimate of one record.
+        time: shape (T,), time of every step.
+        labels: ``state_names``, ``input_names``, ``output_names`` and the units likewise, passed to
+            `Alarm.describe`.
+
+    Returns:
+        One dictionary per alarm: ``time``, ``step``, ``kind``, ``index``, ``gap`` (unit of the component) and
+        ``text``, a sentence.
+    """
+    return [
+        {
+            "time": float(time[alarm.step]),
+            "step": int(alarm.step),
+            "kind": str(alarm.kind),
+            "index": int(alarm.index),
+            "gap": float(alarm.gap),
+            "text": alarm.describe(**labels),
+        }
+        for alarm in est.alarms()
+    ]
+
+
+def _time(time: Any, steps: int) -> tuple[np.ndarray, dict[str, str]]:
+    if time is None:
+        return np.arange(steps, dtype=np.float64), {"long_name": "step"}
+    time = np.asarray(time, dtype=np.float64)
+    if time.shape != (steps,):
+        raise ValueError(f"to_dataset: `time` must have shape ({steps},), got {time.shape}")
+    return time, {"units": "s", "long_name": "time"}
+
+
+def _labels(
+    kind: str, names: Sequence[str] | None, units: Sequence[str] | None, count: int, letter: str
+) -> tuple[list[str], list[str]]:
+    names = [f"{letter}{index + 1}" for index in range(count)] if names is None else list(names)
+    units = [""] * count if units is None else list(units)
+    for what, values in (("names", names), ("units", units)):
+        if len(values) != count:
+            raise ValueError(f"to_dataset: `{kind}_{what}` has {len(values)} entries, the estimate has {count}")
+    return names, units
+
+
+def _spoken(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _add_bounds(
+    variables: dict[str, Any], name: str, unit: str, role: str, lower: np.ndarray, upper: np.ndarray, index: int
+) -> None:
+    for side, values in (("lower", lower), ("upper", upper)):
+        attributes = {"units": unit, "long_name": f"{side} bound of {_spoken(name)}", "role": role, "signal": name}
+        variables[f"{name}_{side}"] = ("time", values[:, index], attributes)
+
+
+def _flags() -> dict[str, Any]:
+    members = [member for member in Status if member.value]
+    return {
+        "long_name": "status of the step (0 = OK)",
+        "flag_masks": np.array([member.value for member in members], dtype=np.int32),
+        "flag_meanings": " ".join(str(member.name) for member in members),
+    }

@@ -1,0 +1,178 @@
+"""Gains by linear programming: the exactly optimal one, and the best one for a given box size.
+
+The only module that calls a solver. Nothing it returns is trusted: gains are projected back onto the equality they
+must satisfy, and `GainProblem` evaluates them anew in NumPy.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+
+from gsisio_jax.design.problem import GainProblem
+
+_SPARSE = 1e-7  # scaled gain entries below this are the interior-point solver's noise
+_SOLVER: dict[str, Any] = {
+    "solver": cp.CLARABEL,
+    "tol_gap_abs": 1e-11,
+    "tol_gap_rel": 1e-11,
+    "tol_feas": 1e-11,
+    "tol_infeas_abs": 1e-11,
+    "tol_infeas_rel": 1e-11,
+}
+
+
+def optimal_gain(problem: GainProblem, weight: np.ndarray, scale: np.ndarray) -> np.ndarray | None:
+    """The gain whose steady width is componentwise smallest among all gains, or None if no gain contracts.
+
+    With a weight lambda per state and Y = diag(lambda) N everything is linear (design 4.2):
+
+        minimise 1'b(Y)  subject to  lambda' - 1'|Y_z| R - 1'A(lambda, Y) >= weight',   Y [H; C G] = diag(lambda) G.
+
+    Args:
+        problem: the gain problem.
+        weight: the vector c > 0 (n,); the optimal gain does not depend on it.
+        scale: expected widths (n,), the units in which the program is solved.
+    """
+    inner = problem.scaled(scale)
+    lam = cp.Variable(inner.n, nonneg=True)
+    Y = cp.Variable((inner.n, inner.columns))
+    growth, noise, equality = _rows(inner, cp.diag(lam), Y, np.full(inner.columns, True))
+    # cvxpy needs the column sums as one vector expression: lambda' - 1'(...) >= c'.
+    margin = lam - cp.sum(growth, axis=0)
+    if not solve(cp.Problem(cp.Minimize(cp.sum(noise)), [margin >= weight, *equality])):
+        return None
+    if lam.value is None or Y.value is None or lam.value.min() <= 0:
+        return None
+    return _finish(problem, inner, Y.value / lam.value[:, None], scale, np.full(inner.columns, True))
+
+
+def profile_gain(problem: GainProblem, width: np.ndarray, usable: np.ndarray, scale: np.ndarray) -> np.ndarray | None:
+    """The gain that is best, row by row, for boxes of the given width, using only some of the measurements.
+
+    Args:
+        problem: the gain problem.
+        width: width (n,) of the box before the step.
+        usable: (columns,) False for entries of [y[k-1], z[k], state bounds] that must not be used.
+        scale: units of the states in which the program is solved (n,).
+
+    Returns:
+        N (n, columns) with every row optimal, or None if the input cannot be cancelled with these measurements.
+
+    Source: design 4.2, "A bank of gains".
+    """
+    inner = problem.scaled(scale)
+    N = cp.Variable((inner.n, inner.columns))
+    growth, noise, equality = _rows(inner, np.eye(inner.n), N, usable)
+    # Rows are independent: any positive combination of their costs has the same minimiser.
+    goal = cp.Problem(cp.Minimize(cp.sum(growth @ (width / scale)) + cp.sum(noise)), equality)
+    if not solve(goal) or N.value is None:
+        return None
+    return _finish(problem, inner, N.value, scale, usable)
+
+
+def improve(problem: GainProblem, N: np.ndarray, rounds: int = 4) -> np.ndarray:
+    """Policy iteration: replace rows by better ones at the current steady width until nothing changes.
+
+    The linear program already is at the optimum up to the solver's tolerance; this takes it to rounding.
+    """
+    everything = np.full(problem.columns, True)
+    for _ in range(rounds):
+        width = problem.steady_width(N)
+        if not np.isfinite(width).all():
+            return N
+        scale = _positive(width)
+        candidate = profile_gain(problem, width, everything, scale)
+        if candidate is None:
+            return N
+        better = problem.row_cost(candidate, width) < problem.row_cost(N, width) * (1 - 1e-12)
+        if not better.any():
+            return N
+        mixed = np.where(better[:, None], candidate, N)
+        after = problem.steady_width(mixed)
+        if not (after <= width).all():
+            return N
+        N = mixed
+        if (after >= width * (1 - 1e-10)).all():
+            return N
+    return N
+
+
+def _rows(inner: GainProblem, L: Any, Y: Any, usable: np.ndarray) -> tuple[Any, Any, list[Any]]:
+    """Expressions of diag(L) (A + |N_z| R), of diag(L) b, and the equality, all linear in (L, Y)."""
+    l, q = inner.l, inner.q
+    Y_y, Y_z, Y_s = Y[:, :l], Y[:, l : l + q], Y[:, l + q :]
+    P = L - Y[:, l:] @ inner.C if inner.columns > l else L
+    N_yE = Y_y @ inner.E if l else np.zeros((inner.n, inner.n))
+    growth = cp.abs(P @ inner.F - N_yE)
+    noise = cp.abs(P) @ inner.dw
+    if inner.F_radius.any():
+        growth = growth + cp.abs(P) @ inner.F_radius
+    if inner.E_radius.any():
+        growth = growth + cp.abs(Y_y) @ inner.E_radius
+    if inner.R.any():
+        growth = growth + cp.abs(Y_z) @ inner.R
+    if l:
+        noise = noise + cp.abs(Y_y) @ inner.dv
+    if q:
+        noise = noise + cp.abs(Y_z @ inner.T2) @ inner.dv
+    if len(inner.ds):
+        noise = noise + cp.abs(Y_s) @ inner.ds
+    constraints = []
+    residual = L @ inner.G - Y @ inner.seen if inner.G.shape[1] else None
+    if residual is not None and inner.free.any():
+        constraints.append(residual[:, np.flatnonzero(inner.free)] == 0)
+    if residual is not None and not inner.free.all():
+        noise = noise + cp.abs(residual[:, np.flatnonzero(~inner.free)]) @ inner.dd
+    if not usable.all():
+        constraints.append(Y[:, np.flatnonzero(~usable)] == 0)
+    return growth, noise, constraints
+
+
+def solve(goal: cp.Problem) -> bool:
+    """Solve a linear program with Clarabel; True where it claims a solution (which the caller checks)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # "may be inaccurate": the result is checked, not believed
+        try:
+            goal.solve(**_SOLVER)
+        except cp.error.SolverError:
+            return False
+    return goal.status in ("optimal", "optimal_inaccurate")
+
+
+def _finish(
+    problem: GainProblem, inner: GainProblem, N: np.ndarray, scale: np.ndarray, usable: np.ndarray
+) -> np.ndarray | None:
+    """Drop the solver's noise entries, restore the equality exactly, and return to the user's units."""
+    sparse = _project(inner, N, (np.abs(N) > _SPARSE) & usable)
+    plain = _project(inner, N, np.broadcast_to(usable, N.shape))
+    width = np.ones(inner.n)
+    cost_plain, cost_sparse = inner.row_cost(plain, width), inner.row_cost(sparse, width)
+    exact = np.abs(inner.residual(sparse)[:, inner.free]).max(axis=1, initial=0.0) < 1e-12
+    N = np.where((exact & (cost_sparse <= cost_plain * (1 + 1e-6)))[:, None], sparse, plain)
+    if np.abs(inner.residual(N)[:, inner.free]).max(initial=0.0) > 1e-9:
+        return None
+    return _project(problem, problem.unscale(N, scale), N != 0)
+
+
+def _project(problem: GainProblem, N: np.ndarray, support: np.ndarray) -> np.ndarray:
+    """The nearest gain on the given support with ``N [H; C G] = G`` in the columns of free inputs."""
+    N = np.where(support, N, 0.0)
+    seen, target = problem.seen[:, problem.free], problem.G[:, problem.free]
+    if not seen.shape[1]:
+        return N
+    for i in range(problem.n):
+        rows = np.flatnonzero(support[i])
+        for _ in range(2):  # the second pass removes the rounding of the first
+            gap = target[i] - N[i, rows] @ seen[rows]
+            N[i, rows] += np.linalg.lstsq(seen[rows].T, gap, rcond=None)[0] if len(rows) else 0.0
+    return N
+
+
+def _positive(width: np.ndarray) -> np.ndarray:
+    """Widths as units: zero widths replaced by a share of the largest."""
+    largest = width.max(initial=0.0)
+    return np.maximum(width, 1e-6 * largest) if largest > 0 else np.ones_like(width)

@@ -1,0 +1,116 @@
+"""Left inverses for the boxes of the unknown input (design 4.5).
+
+Two families: left inverses J of [G; H] applied to ``[x - f - B u - w; y - g - D u - v]``, and left inverses of the
+lifted rows [H; C G], which see the next output without going through the box of the next state. Each is chosen by a
+linear program to be best at the steady width, row by row.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import cvxpy as cp
+import numpy as np
+
+from gsisio_jax.contraction import Bank
+from gsisio_jax.design.gains import solve
+from gsisio_jax.design.problem import GainProblem, without_rounding
+
+
+def input_bank(problem: GainProblem, width: np.ndarray) -> Bank:
+    """Left inverses as a `Bank` of bounds of d[k-1]; the first is of [G; H] and carries the certificate.
+
+    Args:
+        problem: the gain problem.
+        width: typical width of the state boxes, (n,).
+    """
+    n, l, q, p = problem.n, problem.l, problem.q, problem.G.shape[1]
+    s = problem.columns - l - q
+    direct, lifted = [], []
+    if p:
+        direct = _distinct([_direct(problem, width, use_y) for use_y in (True, False)])
+        lifted = _distinct([_lifted(problem, width, *use) for use in product((True, False), repeat=2)])
+        direct.append(_pseudo_inverse(problem))
+        direct = _distinct(direct)
+    else:
+        direct = [np.zeros((0, n + l))]
+    rows = []
+    for J in direct:
+        known = (np.eye(p) - J @ np.vstack([problem.G, problem.H]))[:, ~problem.free]
+        rows.append((-J, np.zeros((p, l)), np.zeros((p, q)), np.zeros((p, s)), known, J[:, :n]))
+    for L in lifted:
+        L_y, L_z, L_s = problem.split(L)
+        known = (np.eye(p) - L @ problem.seen)[:, ~problem.free]
+        residual = -np.concatenate([without_rounding(L[:, l:] @ problem.C), L_y], axis=1)
+        rows.append((residual, without_rounding(L_z @ problem.T2), L_z, L_s, known, np.zeros((p, n))))
+    return Bank(*(np.stack(parts) for parts in zip(*rows, strict=True)))
+
+
+def _direct(problem: GainProblem, width: np.ndarray, use_y: bool) -> np.ndarray | None:
+    """J with ``J [G; H] = I`` in the columns of free inputs, smallest input width row by row."""
+    n, p = problem.n, problem.G.shape[1]
+    J = cp.Variable((p, n + problem.l))
+    J1, J2 = J[:, :n], J[:, n:]
+    cost = cp.abs(J1) @ (width + problem.dw + problem.F_radius @ width) + cp.abs(J1 @ problem.F + J2 @ problem.E) @ width
+    cost = cost + cp.abs(J2) @ (problem.E_radius @ width + problem.dv)
+    usable = np.concatenate([np.full(n, True), np.full(problem.l, use_y)])
+    return _solve(J, cost, np.vstack([problem.G, problem.H]), problem, usable)
+
+
+def _lifted(problem: GainProblem, width: np.ndarray, use_y: bool, use_measured: bool) -> np.ndarray | None:
+    """L with ``L [H; C G] = I`` in the columns of free inputs."""
+    l, q, p = problem.l, problem.q, problem.G.shape[1]
+    L = cp.Variable((p, problem.columns))
+    L_y, L_z, L_s = L[:, :l], L[:, l : l + q], L[:, l + q :]
+    through = L[:, l:] @ problem.C
+    cost = cp.abs(L_y @ problem.E + through @ problem.F) @ width + cp.abs(through) @ (
+        problem.F_radius @ width + problem.dw
+    )
+    cost = cost + cp.abs(L_y) @ (problem.E_radius @ width + problem.dv)
+    if q:
+        cost = cost + cp.abs(L_z) @ (problem.R @ width) + cp.abs(L_z @ problem.T2) @ problem.dv
+    if len(problem.ds):
+        cost = cost + cp.abs(L_s) @ problem.ds
+    usable = np.concatenate([np.full(l, use_y), np.full(q, use_measured), np.full(len(problem.ds), True)])
+    return _solve(L, cost, problem.seen, problem, usable)
+
+
+def _solve(
+    J: cp.Variable, cost: cp.Expression, stacked: np.ndarray, problem: GainProblem, usable: np.ndarray
+) -> np.ndarray | None:
+    p = problem.G.shape[1]
+    gap = np.eye(p) - J @ stacked
+    free, bounded = np.flatnonzero(problem.free), np.flatnonzero(~problem.free)
+    constraints = []
+    if len(free):
+        constraints.append(gap[:, free] == 0)
+    if len(bounded):
+        cost = cost + cp.abs(gap[:, bounded]) @ problem.dd
+    if not usable.all():
+        constraints.append(J[:, np.flatnonzero(~usable)] == 0)
+    # Rows are independent; divide by the size of a unit input so that inputs of any unit count alike.
+    weights = np.abs(stacked).max(axis=0)
+    if not solve(cp.Problem(cp.Minimize(weights @ cost), constraints)) or J.value is None:
+        return None
+    found = np.where((np.abs(J.value) > 1e-9 * np.abs(J.value).max()) & usable, J.value, 0.0)
+    for i in range(p):  # restore the equality on the entries that are left
+        rows = np.flatnonzero(found[i])
+        for _ in range(2):
+            rest = np.eye(p)[i, free] - found[i] @ stacked[:, free]
+            if len(rows) and len(free):
+                found[i, rows] += np.linalg.lstsq(stacked[np.ix_(rows, free)].T, rest, rcond=None)[0]
+    residual = np.abs((np.eye(p) - found @ stacked)[:, free]).max(initial=0.0)
+    return found if residual < 1e-9 else None
+
+
+def _pseudo_inverse(problem: GainProblem) -> np.ndarray:
+    """The paper's left inverse of [G; H]."""
+    return without_rounding(np.linalg.pinv(np.vstack([problem.G, problem.H])))
+
+
+def _distinct(found: list[np.ndarray | None]) -> list[np.ndarray]:
+    kept: list[np.ndarray] = []
+    for matrix in found:
+        if matrix is not None and not any(np.allclose(matrix, other, rtol=1e-7, atol=1e-12) for other in kept):
+            kept.append(matrix)
+    return kept

@@ -1,0 +1,168 @@
+"""The data of the gain problem, and what one gain is worth: the width recursion of the current form.
+
+Every gain ``N = [N_y N_z]`` with ``N_y H + N_z C G = G`` gives the identity
+
+    x[k] = P (f + B u + w)[k-1] + N_y (y - g - D u - v)[k-1] + N_z (z - T2 v - psi(x))[k],     P = I - N_z C,
+
+so on a region where ``df in F +- F_radius``, ``dg in E +- E_radius`` and ``|d psi| <= R`` the widths obey
+
+    (I - |N_z| R) width[k] <= A width[k-1] + b.
+
+State bounds with two finite sides take part as pseudo-measurements: rows of the identity under C, known to within the
+width of the bound. Inputs with known bounds need no cancellation; what the gain leaves of them is noise.
+Source: design 4.1, 4.2 and 4.6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsisio_jax.certificate import spectral_radius
+
+
+@dataclass(frozen=True)
+class GainProblem:
+    """Matrices of the gain problem; l outputs, q rows of T2, s bounded states, p inputs.
+
+    Attributes:
+        F, F_radius: enclosure of df, (n, n).
+        E, E_radius: enclosure of dg, (l, n).
+        T2: (q, l).
+        C: (q + s, n): slopes chosen for T2 g, then rows of the identity for bounded states.
+        R: (q, n), bound of |d(T2 g) - C|.
+        G, H: (n, p), (l, p).
+        free: (p,) True where nothing is known of the input.
+        dw, dv, ds, dd: widths of w (n,), v (l,), state bounds (s,), bounded inputs (p - free,).
+    """
+
+    F: np.ndarray
+    F_radius: np.ndarray
+    E: np.ndarray
+    E_radius: np.ndarray
+    T2: np.ndarray
+    C: np.ndarray
+    R: np.ndarray
+    G: np.ndarray
+    H: np.ndarray
+    free: np.ndarray
+    dw: np.ndarray
+    dv: np.ndarray
+    ds: np.ndarray
+    dd: np.ndarray
+
+    @property
+    def n(self) -> int:
+        return self.F.shape[0]
+
+    @property
+    def l(self) -> int:
+        return self.E.shape[0]
+
+    @property
+    def q(self) -> int:
+        return self.T2.shape[0]
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of a gain [N_y N_z]."""
+        return self.l + self.C.shape[0]
+
+    @property
+    def seen(self) -> np.ndarray:
+        """``[H; C G]``: what of the input reaches y[k-1] and z[k], shape (columns, p)."""
+        return np.vstack([self.H, self.C @ self.G])
+
+    def split(self, N: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A gain as (N_y, its part on T2 y, its part on the state bounds)."""
+        return N[:, : self.l], N[:, self.l : self.l + self.q], N[:, self.l + self.q :]
+
+    def residual(self, N: np.ndarray) -> np.ndarray:
+        """``G - N_y H - N_z C G``: must vanish in the columns of free inputs."""
+        return self.G - N @ self.seen
+
+    def growth(self, N: np.ndarray) -> np.ndarray:
+        """A of the width recursion, (n, n)."""
+        P = np.eye(self.n) - N[:, self.l :] @ self.C
+        N_y = N[:, : self.l]
+        return np.abs(P @ self.F - N_y @ self.E) + np.abs(P) @ self.F_radius + np.abs(N_y) @ self.E_radius
+
+    def implicit(self, N: np.ndarray) -> np.ndarray:
+        """``|N_z| R``: how the remainder at x[k] itself enters, (n, n)."""
+        return np.abs(self.split(N)[1]) @ self.R
+
+    def noise_width(self, N: np.ndarray) -> np.ndarray:
+        """b of the width recursion, (n,)."""
+        N_y, N_z, N_s = self.split(N)
+        P = np.eye(self.n) - N[:, self.l :] @ self.C
+        known = np.abs(self.residual(N)[:, ~self.free]) @ self.dd
+        return (
+            np.abs(P) @ self.dw + np.abs(N_y) @ self.dv + np.abs(N_z @ self.T2) @ self.dv + np.abs(N_s) @ self.ds + known
+        )
+
+    def row_cost(self, N: np.ndarray, width: np.ndarray) -> np.ndarray:
+        """Width after one step from a box of that width, row by row, (n,)."""
+        return (self.growth(N) + self.implicit(N)) @ width + self.noise_width(N)
+
+    def rate(self, N: np.ndarray) -> float:
+        """Spectral radius of ``A + |N_z| R``: below 1 the widths converge."""
+        return spectral_radius(self.growth(N) + self.implicit(N))
+
+    def steady_width(self, N: np.ndarray) -> np.ndarray:
+        """``(I - |N_z| R - A)^{-1} b``, infinite where the recursion does not contract."""
+        return steady_state(self.growth(N) + self.implicit(N), self.noise_width(N))
+
+    def scaled(self, x: np.ndarray) -> GainProblem:
+        """The same problem in units `x` of the states, (n,), and in units of the noise for the outputs."""
+        y = np.where(self.dv > 0, self.dv, 1.0)
+        z = np.abs(self.T2) @ y
+        zs = np.concatenate([z, x[self._bounded()]])
+        stacked = np.vstack([self.G / x[:, None], self.H / y[:, None]])
+        d = 1.0 / np.abs(stacked).max(axis=0, initial=0.0, where=np.ones_like(stacked, dtype=bool))
+        return replace(
+            self,
+            F=self.F / x[:, None] * x,
+            F_radius=self.F_radius / x[:, None] * x,
+            E=self.E / y[:, None] * x,
+            E_radius=self.E_radius / y[:, None] * x,
+            T2=self.T2 / z[:, None] * y,
+            C=self.C / zs[:, None] * x,
+            R=self.R / z[:, None] * x,
+            G=self.G / x[:, None] * d,
+            H=self.H / y[:, None] * d,
+            dw=self.dw / x,
+            dv=self.dv / y,
+            ds=self.ds / x[self._bounded()],
+            dd=self.dd / d[~self.free],
+        )
+
+    def unscale(self, N: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """A gain of `scaled(x)` in the original units."""
+        y = np.where(self.dv > 0, self.dv, 1.0)
+        columns = np.concatenate([y, np.abs(self.T2) @ y, x[self._bounded()]])
+        return N * x[:, None] / columns
+
+    def _bounded(self) -> np.ndarray:
+        """Indices of the states that the pseudo-measurement rows of C stand for."""
+        return self.C[self.q :].argmax(axis=1) if len(self.C) > self.q else np.zeros(0, dtype=int)
+
+
+def steady_state(growth: np.ndarray, noise_width: np.ndarray) -> np.ndarray:
+    """Fixed point of ``w = growth w + noise_width`` for a nonnegative matrix; all ``inf`` if there is none.
+
+    The solve alone is not trusted: a nonnegative inverse of ``I - growth`` is equivalent to a spectral radius below 1,
+    and both are looked at.
+    """
+    n = len(noise_width)
+    if spectral_radius(growth) >= 1.0 - 1e-9:
+        return np.full(n, np.inf)
+    inverse = np.linalg.inv(np.eye(n) - growth)
+    if inverse.min() < -1e-9 * np.abs(inverse).max():
+        return np.full(n, np.inf)
+    return np.maximum(inverse, 0.0) @ noise_width
+
+
+def without_rounding(matrix: np.ndarray) -> np.ndarray:
+    """Zero where only rounding is left: a stray 1e-17 times an unbounded box would be unbounded."""
+    return np.where(np.abs(matrix) < 1e-13 * np.abs(matrix).max(initial=0.0), 0.0, matrix)

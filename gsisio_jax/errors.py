@@ -1,0 +1,18 @@
+"""Errors of the offline design. All are `ValueError`s, so that one `except` clause serves a script."""
+
+from __future__ import annotations
+
+
+class ObserverDoesNotExist(ValueError):
+    """Proved: some input direction leaves no trace in any output, so no observer can bound it.
+
+    The message names the direction and the remedies (measure more, give `input_bounds` or `state_bounds`).
+    Source: design 4.1.
+    """
+
+
+class NoDesignFound(ValueError):
+    """No gain with finite boxes was found; the message says what failed and what may help. Not a proof of absence.
+
+    Source: design 4.1.
+    """

@@ -1,0 +1,269 @@
+"""`estimate`: a whole record at once, as one compiled `lax.scan` over the step of `observer`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.alarms import Alarm, read_alarms
+from gsisio_jax.interval import Interval, is_concrete
+from gsisio_jax.observer import Carry, Observer, StepOutput, advance as _advance, begin
+from gsisio_jax.system import Noise
+
+OnConflict = Literal["restart", "hold"]
+
+
+class Estimate(eqx.Module):
+    """Boxes of a record; a pytree. Under `jax.vmap` every array gains the batch axes in front.
+
+    Attributes:
+        state: box of x[k] from y[0..k], (T, n).
+        input: box of d[k] from y[0..k+1], (T-1, p).
+        current_input: box of V1' d[k] from y[0..k], (T, p_H).
+        status: `Status` bit mask, (T,).
+        margin: (T,) signed slack of the tightest intersection of the step; negative is the size of a contradiction, in
+            the unit of the component that `alarms` names.
+        source: (T,) code of that intersection (`gsisio_jax.status.Source`).
+
+    Source: design 7 and 4.6.
+    """
+
+    state: Interval
+    input: Interval
+    current_input: Interval
+    status: Any
+    margin: Any
+    source: Any
+    output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    def alarms(self) -> list[Alarm]:
+        """Every step whose data contradict the stated bounds, in order, with what emptied and by how much.
+
+        Raises:
+            ValueError: the estimate is batched; take one record first.
+        """
+        return read_alarms(self.status, self.margin, self.source, self.output_rows)
+
+
+def estimate(
+    observer: Observer,
+    initial: Interval,
+    y: Any,
+    u: Any = None,
+    noise: Noise | None = None,
+    on_conflict: OnConflict = "restart",
+    length: Any = None,
+) -> Estimate:
+    """Boxes that are certain to contain the states and the unknown inputs of a record.
+
+    Compiled once per shape; new numbers, another noise or another initial box compile nothing. Works under `jax.jit`,
+    `jax.vmap` over any of `initial`, `y`, `u`, `noise`, `length`, and `jax.grad`.
+
+    Args:
+        observer: from `design_observer`.
+        initial: box of x[0] before y[0], (n,); infinite sides allowed.
+        y: measurements (T, l), units of the outputs; NaN marks a missing entry.
+        u: known inputs (T, m), finite; needed where m > 0.
+        noise: bounds at run time; None takes those of the design. Bounds of shape (T, .) change with time.
+        on_conflict: where the data contradict the bounds, go on from y[k] and the state bounds alone ("restart"), or
+            from the past alone with y[k] taken as missing ("hold"). Nothing after a conflict is certain unless the data
+            that follow are right.
+        length: number of rows of `y` that count (ragged batches); rows behind are taken as missing.
+
+    Returns:
+        `Estimate`.
+
+    Raises:
+        ValueError: shapes do not agree, `u` is missing or not finite, `y` is infinite, or `on_conflict` is unknown.
+
+    Source: design 4.3 and 7.
+    """
+    initial, y, u, noise, observer = _prepare("estimate", observer, initial, y, u, noise, rows=True)
+    if length is not None:
+        y = jnp.where((jnp.arange(y.shape[0]) < length)[:, None], y, jnp.nan)
+    return _estimate(observer, initial, y, u, noise, _hold("estimate", on_conflict))
+
+
+def start(
+    observer: Observer,
+    initial: Interval,
+    y0: Any,
+    u0: Any = None,
+    noise: Noise | None = None,
+    on_conflict: OnConflict = "restart",
+) -> tuple[Carry, StepOutput]:
+    """First step of an online run (k = 0): the initial box met with the first measurement.
+
+    Args:
+        observer: from `design_observer`.
+        initial: box of x[0], (n,).
+        y0: first measurement (l,), NaN where missing.
+        u0: first known input (m,).
+        noise: bounds of w[0] and v[0]; None takes those of the design.
+        on_conflict: as in `estimate`.
+
+    Returns:
+        The carry for `step` (a pytree that can be saved), and a `StepOutput`.
+
+    Source: design 7.
+    """
+    initial, y0, u0, noise, observer = _prepare("start", observer, initial, y0, u0, noise, rows=False)
+    return _start(observer, initial, y0, u0, noise, _hold("start", on_conflict))
+
+
+def step(
+    observer: Observer,
+    carry: Carry,
+    y_k: Any,
+    u_k: Any = None,
+    noise: Noise | None = None,
+    on_conflict: OnConflict = "restart",
+) -> tuple[Carry, StepOutput]:
+    """One step of an online run: the same numbers as `estimate`.
+
+    Args:
+        observer: from `design_observer`.
+        carry: from `start` or `step`.
+        y_k: measurement (l,), NaN where missing.
+        u_k: known input (m,).
+        noise: bounds of w[k] and v[k]; None takes those of the design.
+        on_conflict: as in `estimate`.
+
+    Returns:
+        The next carry, and a `StepOutput`; its `input` is the box of d[k-1].
+
+    Source: design 7.
+    """
+    _, y_k, u_k, noise, observer = _prepare("step", observer, carry.state, y_k, u_k, noise, rows=False)
+    return _step(observer, carry, y_k, u_k, noise, _hold("step", on_conflict))
+
+
+def resume(
+    observer: Observer,
+    carry: Carry,
+    y: Any,
+    u: Any = None,
+    noise: Noise | None = None,
+    on_conflict: OnConflict = "restart",
+) -> tuple[Carry, StepOutput]:
+    """Many steps of an online run in one compiled scan: `y` (rows, l) follows the measurement that `carry` has seen.
+
+    Returns:
+        The carry after the last row, and a `StepOutput` whose arrays have one row per row of `y`.
+    """
+    _, y, u, noise, observer = _prepare("resume", observer, carry.state, y, u, noise, rows=True)
+    return _resume(observer, carry, y, u, noise, _hold("resume", on_conflict))
+
+
+def collect(observer: Observer, outputs: Sequence[StepOutput]) -> Estimate:
+    """Join the outputs of `start`, `step` and `resume`, in order, into the `Estimate` of the whole record."""
+    rows = [jax.tree.map(lambda x: x[None], out) if jnp.ndim(out.status) == 0 else out for out in outputs]
+    return _as_estimate(observer, jax.tree.map(lambda *x: jnp.concatenate(x), *rows))
+
+
+@partial(jax.jit, static_argnames="hold")
+def _estimate(observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Estimate:
+    carry, first = begin(observer, initial, y[0], u[0], _row(noise, 0), hold)
+    _, rest = _scan(observer, carry, y[1:], u[1:], _rows_from(noise, 1), hold)
+    return _as_estimate(observer, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest))
+
+
+@partial(jax.jit, static_argnames="hold")
+def _start(observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    return begin(observer, initial, y, u, noise, hold)
+
+
+@partial(jax.jit, static_argnames="hold")
+def _step(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    return _advance(observer, carry, y, u, noise, hold)
+
+
+@partial(jax.jit, static_argnames="hold")
+def _resume(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    return _scan(observer, carry, y, u, noise, hold)
+
+
+def _scan(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
+    """Bounds that change with time travel with the rows; constant ones stay outside the loop."""
+    varying = Noise.unchecked(*(box if len(box.shape) == 2 else None for box in (noise.w, noise.v)))
+
+    def body(carry: Carry, row: Any) -> tuple[Carry, StepOutput]:
+        y_k, u_k, now = row
+        bounds = Noise.unchecked(
+            noise.w if now.w is None else now.w,
+            noise.v if now.v is None else now.v,
+        )
+        return _advance(observer, carry, y_k, u_k, bounds, hold)
+
+    return jax.lax.scan(body, carry, (y, u, varying))
+
+
+def _row(noise: Noise, k: int) -> Noise:
+    return Noise.unchecked(*(box[k] if len(box.shape) == 2 else box for box in (noise.w, noise.v)))
+
+
+def _rows_from(noise: Noise, k: int) -> Noise:
+    return Noise.unchecked(*(box[k:] if len(box.shape) == 2 else box for box in (noise.w, noise.v)))
+
+
+def _as_estimate(observer: Observer, out: StepOutput) -> Estimate:
+    return Estimate(
+        out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows
+    )
+
+
+def _hold(call: str, on_conflict: str) -> bool:
+    if on_conflict not in ("restart", "hold"):
+        raise ValueError(f'{call}: `on_conflict` must be "restart" or "hold", got {on_conflict!r}')
+    return on_conflict == "hold"
+
+
+def _prepare(
+    call: str, observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise | None, rows: bool
+) -> tuple[Interval, Any, Any, Noise, Observer]:
+    """Check shapes (and values of concrete arrays), and bring everything to one dtype, bounds rounded outward."""
+    system = observer.system
+    lead = "(T, " if rows else "("
+    y = y if isinstance(y, jax.Array) else np.asarray(y, dtype=np.float64)
+    if not isinstance(initial, Interval) or initial.shape != (system.n,):
+        raise ValueError(
+            f"{call}: `initial` must be an Interval of shape ({system.n},), got {getattr(initial, 'shape', initial)}; "
+            "for many boxes use jax.vmap"
+        )
+    if y.ndim != 1 + rows or y.shape[-1] != system.l or (rows and y.shape[0] == 0 and call == "estimate"):
+        raise ValueError(
+            f"{call}: measurements must have shape {lead}{system.l}) with T >= 1, got {y.shape}; for many records use "
+            "jax.vmap"
+        )
+    if is_concrete(y) and np.isinf(np.asarray(y)).any():
+        raise ValueError(f"{call}: a measurement is infinite; mark missing entries with NaN")
+    dtype = jnp.result_type(initial.dtype, y.dtype)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        dtype = jnp.result_type(float)
+    dtype = jax.dtypes.canonicalize_dtype(dtype)
+    if u is None:
+        if system.m > 0:
+            raise ValueError(f"{call}: the system has {system.m} known inputs; give `u` of shape {lead}{system.m})")
+        u = np.zeros((*y.shape[:-1], 0))
+    if np.shape(u) != (*y.shape[:-1], system.m):
+        raise ValueError(
+            f"{call}: `u` must have shape {(*y.shape[:-1], system.m)}, one row per measurement, got {np.shape(u)}"
+        )
+    if is_concrete(u) and not np.isfinite(np.asarray(u)).all():
+        raise ValueError(f"{call}: `u` must be finite in every row; a known input cannot be missing")
+    noise = observer.noise if noise is None else noise
+    for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
+        legal = [(size,), (y.shape[0], size)] if rows else [(size,)]
+        if box.shape not in legal:
+            raise ValueError(
+                f"{call}: the noise bounds of `{name}` must have shape {' or '.join(map(str, legal))}, got {box.shape}"
+            )
+    if dtype != np.float64:
+        observer = observer.astype(dtype)
+    return initial.astype(dtype), jnp.asarray(y, dtype), jnp.asarray(u, dtype), noise.astype(dtype), observer

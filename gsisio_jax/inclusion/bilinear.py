@@ -1,0 +1,219 @@
+"""Rules for two arguments that multiply: products, quotients, powers, matrix products, and the angle of a vector."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.inclusion.curves import CURVES, RECIPROCAL, SQUARE, power
+from gsisio_jax.inclusion.linear import add, move, multiple, structural, total
+from gsisio_jax.inclusion.node import (
+    Node,
+    as_node,
+    best_form,
+    choose,
+    entire_like,
+    is_node,
+    join,
+    meet,
+    parts,
+    product,
+    shift,
+    slope_of,
+    stretch,
+    times,
+)
+from gsisio_jax.inclusion.univariate import apply, extremes
+from gsisio_jax.interval import Interval, is_concrete
+
+
+def multiply(x: Any, y: Any) -> Node:
+    """Product; linear if one factor is a constant, else the bilinear envelope around the two centers."""
+    if not is_node(x):
+        return multiple(x, y)
+    if not is_node(y):
+        return multiple(y, x)
+    natural = product(x.range, y.range)
+    box, _ = parts([x, y])
+    form = None
+    if box is not None:
+        # x y = cy x + cx y - cx cy + (x - cx)(y - cy), and the last term is the only one that is not linear.
+        cx, cy = x.range.center, y.range.center
+        spread = times(x.range.radius, y.range.radius)
+        linear = shift(stretch(cy, x.offset), stretch(cx, y.offset))
+        offset = shift(linear, Interval.unchecked(-cx * cy - spread, -cx * cy + spread))
+        form = best_form(cy * slope_of(x, box) + cx * slope_of(y, box), offset, natural, box)
+    jac_x = None if x.jac is None else product(y.range, x.jac)
+    jac_y = None if y.jac is None else product(x.range, y.jac)
+    node = Node(natural, form, join(jac_x, jac_y))
+    return meet(node) if x.form is not None and y.form is not None else node
+
+
+def divide(x: Any, y: Any) -> Node:
+    """Quotient; a divisor that may be 0 leaves nothing known."""
+    if is_node(y):
+        return multiply(x, apply(RECIPROCAL, y))
+    y = jnp.asarray(y)
+    if is_concrete(y):
+        zero = np.asarray(y) == 0
+        return multiple(1 / y, x) if not zero.any() else _unknown_where(zero, multiple(1 / jnp.where(zero, 1, y), x))
+    zero = y == 0
+    return _unknown_where(zero, multiple(1 / jnp.where(zero, 1, y), x))
+
+
+def _unknown_where(mask: Any, x: Node) -> Node:
+    return pick(mask, Node(entire_like(x.range.lower), None, None if x.jac is None else entire_like(x.jac.lower)), x)
+
+
+def pick(mask: Any, x: Node, y: Node) -> Node:
+    """Elementwise `x` where the mask (not a node) holds, else `y`."""
+    return structural(lambda a, b: jnp.where(mask, a, b), [x, y])[0]
+
+
+def raise_to(x: Any, p: Any) -> Node:
+    """``x ** p`` with JAX's own domain: a negative base has a power only for an integer exponent."""
+    if not is_node(p) and is_concrete(p) and np.size(p) > 0 and (np.asarray(p) == np.ravel(p)[0]).all():
+        return integer_power(x, float(np.ravel(p)[0]))
+    log, exp = CURVES["log"], CURVES["exp"]
+    if not is_node(x):
+        good = jnp.asarray(x) > 0
+        return _unknown_where(~good, apply(exp, multiple(jnp.log(jnp.where(good, x, 1)), p)))
+    result = apply(exp, multiply(p, apply(log, x)))
+    # Without knowing that the exponent is no integer, nothing can be said of negative bases.
+    return _unknown_where(x.range.lower < 0, result)
+
+
+def integer_power(x: Node, p: float) -> Node:
+    """``x ** p`` for a number p known in advance."""
+    if p == 0:
+        return multiple(0, x) if x.jac is None and x.form is None else add(multiple(0, x), jnp.ones(x.shape, x.dtype))
+    return x if p == 1 else apply(power(p), x)
+
+
+def dot(x: Any, y: Any, dimensions: Any, same: bool) -> Node:
+    """Matrix product in the general form of ``lax.dot_general``, written as products and a sum.
+
+    The factors are small and half of them are boxes; a real matrix product would meet ``0 * inf``.
+    """
+    (contract_x, contract_y), (batch_x, batch_y) = dimensions
+    ndim_x, ndim_y = (v.range.lower.ndim if is_node(v) else jnp.ndim(v) for v in (x, y))
+    free_x = [i for i in range(ndim_x) if i not in (*contract_x, *batch_x)]
+    free_y = [i for i in range(ndim_y) if i not in (*contract_y, *batch_y)]
+
+    def spread(batch: Sequence[int], free: Sequence[int], contract: Sequence[int], before: int, after: int) -> Any:
+        """Axes in the order: batch, free of x, free of y, contracted."""
+
+        def call(v: Any) -> Any:
+            v = jnp.transpose(v, (*batch, *free, *contract))
+            gap = len(batch) + (0 if before else len(free))
+            return jnp.expand_dims(v, tuple(range(gap, gap + before + after)))
+
+        return call
+
+    wide_x = move(spread(batch_x, free_x, contract_x, 0, len(free_y)), x)
+    wide_y = move(spread(batch_y, free_y, contract_y, len(free_x), 0), y)
+    if same and not free_x and not free_y and tuple(contract_x) == tuple(contract_y):
+        terms = apply(SQUARE, wide_x)
+    else:
+        shape = jnp.broadcast_shapes(*(v.shape for v in (wide_x, wide_y)))
+        wide_x, wide_y = (move(lambda v: jnp.broadcast_to(v, shape), v) for v in (wide_x, wide_y))
+        terms = multiply(wide_x, wide_y)
+    rank = terms.range.lower.ndim
+    return total(terms, range(rank - len(contract_x), rank))
+
+
+def reduce_products(x: Node, axes: Sequence[int], rule: Any) -> Node:
+    """Fold a rule of two nodes over axes, halving: for products, maxima and minima of entries."""
+    axes = sorted(axes)
+    rank = x.range.lower.ndim
+    keep = [i for i in range(rank) if i not in axes]
+    shape = [x.shape[i] for i in keep]
+    x = move(lambda v: jnp.transpose(v, (*axes, *keep)).reshape(-1, *shape), x)
+    while (count := x.shape[0]) > 1:
+        half = count // 2
+        folded = rule(move(lambda v, h=half: v[:h], x), move(lambda v, h=half: v[h : 2 * h], x))
+        if count % 2:
+            last = move(lambda v: v[-1:], x)
+            folded = structural(lambda a, b: jnp.concatenate([a, b]), [folded, last])[0]
+        x = folded
+    return move(lambda v: v[0], x)
+
+
+def angle(y: Any, x: Any) -> Node:
+    """``atan2(y, x)``: exact over all quadrants; across the cut (x < 0, y = 0) it is ``[-pi, pi]``.
+
+    Away from origin and cut, the angle is a harmonic function of the point, and so is what is left after a slope is
+    taken off: its extremes lie on the edges of the rectangle, where they are known in closed form.
+    """
+    shape, dtype = (y.shape, y.dtype) if is_node(y) else (x.shape, x.dtype)
+    y, x = (v if is_node(v) else as_node(v, shape, dtype) for v in (y, x))
+    yl, yu, xl, xu = y.range.lower, y.range.upper, x.range.lower, x.range.upper
+    cut = (xl < 0) & (yl < 0) & (yu >= 0)
+    corners = extremes([_angle_at(b, a) for a in (xl, xu) for b in (yl, yu)])
+    half_turn = jnp.full_like(xl, math.pi)
+    natural = choose(cut, Interval.unchecked(-half_turn, half_turn), corners)
+    box, jac = parts([y, x])
+    smooth = ~cut & ~((xl <= 0) & (xu >= 0) & (yl <= 0) & (yu >= 0))
+    form = None
+    if box is not None:
+        finite = smooth & jnp.isfinite(yl) & jnp.isfinite(yu) & jnp.isfinite(xl) & jnp.isfinite(xu)
+        yl, yu, xl, xu = (jnp.where(finite, v, 1) for v in (yl, yu, xl, xu))
+        cy, cx = 0.5 * yl + 0.5 * yu, 0.5 * xl + 0.5 * xu
+        square = cx * cx + cy * cy
+        sy, sx = cx / square, -cy / square
+        points = [(b, a) for a in (xl, xu) for b in (yl, yu)]
+        for edge in (xl, xu):
+            t = _safe_root(edge, sy)
+            points += [(jnp.clip(side * t, yl, yu), edge) for side in (1, -1)]
+        for edge in (yl, yu):
+            t = _safe_root(-edge, sx)
+            points += [(edge, jnp.clip(side * t, xl, xu)) for side in (1, -1)]
+        # A point clipped to the edge is a corner: still on the rectangle, so nothing is lost by looking at it.
+        rest = extremes([_angle_at(b, a) - sy * b - sx * a for b, a in points])
+        linear = shift(stretch(sy, y.offset), stretch(sx, x.offset))
+        offset = choose(finite, shift(linear, rest), natural)
+        slope = jnp.where(finite, sy * slope_of(y, box) + sx * slope_of(x, box), 0)
+        form = best_form(slope, offset, natural, box)
+    if jac is None:
+        return Node(natural, form)
+    over_y = _pull(x.range, y.range, smooth)
+    over_x = _pull(y.range, x.range, smooth)
+    jac_y = None if y.jac is None else product(over_y, y.jac)
+    jac_x = None if x.jac is None else product(Interval.unchecked(-over_x.upper, -over_x.lower), x.jac)
+    return Node(natural, form, join(jac_y, jac_x))
+
+
+def _safe_root(edge: Any, slope: Any) -> Any:
+    """Where the derivative ``edge / (edge^2 + t^2)`` along an edge equals the slope: t >= 0, or 0 if nowhere."""
+    edge, slope = jax.lax.stop_gradient(edge), jax.lax.stop_gradient(slope)
+    square = edge / jnp.where(slope == 0, 1, slope) - edge * edge
+    return jnp.sqrt(jnp.where((slope != 0) & (square > 0), square, 0))
+
+
+def _angle_at(y: Any, x: Any) -> Any:
+    """``atan2`` at a corner, which may lie at infinity or at the origin; ``-0`` counts as 0."""
+    y = y + 0.0
+    plain = jnp.isfinite(x) & jnp.isfinite(y) & ((x != 0) | (y != 0))
+    smooth = jnp.arctan2(jnp.where(plain, y, 0), jnp.where(plain, x, 1))
+    return jnp.where(plain, smooth, jax.lax.stop_gradient(jnp.arctan2(y, x)))
+
+
+def _pull(a: Interval, b: Interval, smooth: Any) -> Interval:
+    """Exact range of ``a / (a^2 + b^2)`` over a rectangle without the origin: harmonic, so look at its edges."""
+
+    def at(p: Any, q: Any) -> Any:
+        good = smooth & jnp.isfinite(p) & jnp.isfinite(q) & ((p != 0) | (q != 0))
+        p, q = jnp.where(good, p, 0), jnp.where(good, q, 1)
+        return p / (p * p + q * q)
+
+    values = [at(p, q) for p in (a.lower, a.upper) for q in (b.lower, b.upper)]
+    zero = jnp.clip(jnp.zeros_like(b.lower), b.lower, b.upper)
+    values += [at(p, zero) for p in (a.lower, a.upper)]
+    for q in (b.lower, b.upper):
+        values += [at(jnp.clip(side * q, a.lower, a.upper), q) for side in (1, -1)]
+    return choose(smooth, extremes(values), entire_like(a.lower))

@@ -1,0 +1,246 @@
+"""The interpreter: walk through a jaxpr and apply the rule of every primitive.
+
+What does not depend on the box is evaluated as usual, so constants need no rule. The derivative rules a function may
+carry are ignored: bounds come from its body.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.extend.core as jex
+import jax.numpy as jnp
+
+from gsisio_jax.inclusion import linear, logic
+from gsisio_jax.inclusion.node import Form, Node, as_node, chain, is_node, jac_of, join, parts, settle, slope_of
+from gsisio_jax.inclusion.table import ARITHMETIC, LIBRARY, MOVES, UnknownPrimitiveError
+from gsisio_jax.interval import Interval
+
+# Longer loops are kept as loops: compile time grows with every unrolled turn.
+_UNROLL = 16
+_OURS, _JAX = os.path.dirname(__file__), os.path.dirname(jax.__file__)
+
+
+def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any]:
+    """Values of a jaxpr's results; arguments and results are constants or nodes."""
+    values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
+
+    def read(atom: Any) -> Any:
+        return jnp.asarray(atom.val, atom.aval.dtype) if isinstance(atom, jex.Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        try:
+            out = _result(eqn, [read(atom) for atom in eqn.invars])
+        except UnknownPrimitiveError as error:
+            if error.place is not None or (place := _caller(eqn)) is None:
+                raise
+            raise UnknownPrimitiveError(error.operation, error.detail, place) from None
+        values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out], strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _result(eqn: Any, args: Sequence[Any]) -> Any:
+    name = eqn.primitive.name
+    if not any(is_node(arg) for arg in args):
+        return _call(eqn, *args) if CALLS.get(name) is _call else eqn.primitive.bind(*args, **eqn.params)
+    by_hand = _BY_HAND.get(name) or _BY_HAND.get(eqn.params.get("name"))
+    if by_hand is not None:
+        value = settle(_apply_by_hand(by_hand, args))
+        return [value] if eqn.primitive.multiple_results else value
+    if name in CALLS:
+        return CALLS[name](eqn, *args)
+    if name in MOVES:
+        return MOVES[name](eqn, *args)
+    if name in ARITHMETIC:
+        value = ARITHMETIC[name](eqn, *(args if name == "dot_general" else _aligned(args, eqn.outvars[0].aval.shape)))
+        return settle(value) if is_node(value) else value
+    raise UnknownPrimitiveError(name)
+
+
+def _aligned(args: Sequence[Any], shape: tuple[int, ...]) -> list[Any]:
+    """JAX lets a scalar meet an array; slopes and Jacobians have one axis more, so their scalars must be spread."""
+    spread = [is_node(arg) and arg.shape == () and shape != () for arg in args]
+    return [
+        linear.move(lambda v: jnp.broadcast_to(v, shape), arg) if wide else arg
+        for arg, wide in zip(args, spread, strict=True)
+    ]
+
+
+def _caller(eqn: Any) -> str | None:
+    """File and line of the user's code that made this equation."""
+    traceback = getattr(eqn.source_info, "traceback", None)
+    for frame in traceback.frames if traceback is not None else ():
+        if not frame.file_name.startswith((_OURS, _JAX)) and "site-packages" not in frame.file_name:
+            return f"{frame.file_name}:{frame.line_num}"
+    return None
+
+
+def _body(eqn: Any) -> tuple[Any, Sequence[Any]]:
+    """The jaxpr that a call primitive runs; its parameter's name moves between primitives and JAX versions."""
+    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+        if name in eqn.params:
+            inner = eqn.params[name]
+            return (inner.jaxpr, inner.consts) if isinstance(inner, jex.ClosedJaxpr) else (inner, ())
+    raise UnknownPrimitiveError(eqn.primitive.name, "without a body")
+
+
+def _call(eqn: Any, *args: Any) -> Any:
+    jaxpr, consts = _body(eqn)
+    name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
+    if name in LIBRARY and source.startswith(_JAX) and any(is_node(arg) for arg in args):
+        return [settle(LIBRARY[name](eqn, *args))]
+    return evaluate(jaxpr, consts, args)
+
+
+def _cond(eqn: Any, index: Any, *args: Any) -> Any:
+    branches = eqn.params["branches"]
+    if not is_node(index) and not isinstance(index, jax.core.Tracer):
+        chosen = branches[min(max(int(index), 0), len(branches) - 1)]
+        return evaluate(chosen.jaxpr, chosen.consts, args)
+    outcomes = [evaluate(branch.jaxpr, branch.consts, args) for branch in branches]
+    if len(branches) == 2 and not is_node(index):
+        index = index != 0
+    return [logic.select(index, *values) for values in zip(*outcomes, strict=True)]
+
+
+def _scan(eqn: Any, *args: Any) -> Any:
+    """Unrolled where it is short: then every turn may find different things constant."""
+    n_consts, n_carry = eqn.params["num_consts"], eqn.params["num_carry"]
+    consts, carry, xs = args[:n_consts], list(args[n_consts : n_consts + n_carry]), args[n_consts + n_carry :]
+    body, length, reverse = eqn.params["jaxpr"], eqn.params["length"], eqn.params["reverse"]
+
+    def turn(carry: Sequence[Any], rows: Sequence[Any]) -> tuple[list[Any], list[Any]]:
+        out = evaluate(body.jaxpr, body.consts, [*consts, *carry, *rows])
+        return list(out[:n_carry]), list(out[n_carry:])
+
+    if length > _UNROLL:
+        return _loop(turn, carry, xs, length, reverse)
+    stacked: list[Any] = [None] * length
+    for i in range(length)[::-1] if reverse else range(length):
+        carry, stacked[i] = turn(carry, [linear.move(lambda v, i=i: v[i], x) for x in xs])
+    return [*carry, *(_stack(list(column)) for column in zip(*stacked, strict=True))]
+
+
+def _stack(rows: list[Any]) -> Any:
+    if any(is_node(row) for row in rows):
+        return linear.structural(lambda *v: jnp.stack(v), rows)[0]
+    return jnp.stack(rows)
+
+
+def _loop(turn: Callable[..., Any], carry: list[Any], xs: Sequence[Any], length: int, reverse: bool) -> list[Any]:
+    """A long scan as a scan over nodes: all its turns must have the same tiers, the fullest that any of them needs."""
+    box, jac = parts([*carry, *xs])
+
+    def promote(value: Any, like: Any) -> Any:
+        """`value` with every tier that `like` has."""
+        if not is_node(like):
+            return value
+        node = value if is_node(value) else as_node(value, jnp.shape(value), like.dtype)
+        form = node.form
+        if like.form is not None and form is None:
+            form = Form(slope_of(node, box), node.range, box)
+        return Node(node.range, form, jac_of(node, jac.lower.shape[0]) if like.jac is not None else node.jac)
+
+    def outward(x: Any) -> Any:
+        """Entries of the scanned axis first, also in slopes and Jacobians."""
+        if not is_node(x):
+            return x
+        form = None if x.form is None else (jnp.swapaxes(x.form.slope, 0, 1), x.form.offset)
+        return x.range, form, jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), x.jac)
+
+    def inward(x: Any) -> Any:
+        if not isinstance(x, tuple):
+            return x
+        return Node(x[0], None if x[1] is None else Form(*x[1], box), x[2])
+
+    def stacked(x: Any) -> Any:
+        return Node(x[0], *_unstack(x[1], x[2], box)) if isinstance(x, tuple) else x
+
+    def step(carry: list[Any], rows: list[Any]) -> tuple[list[Any], list[Any]]:
+        new, out = turn([inward(c) for c in carry], [inward(row) for row in rows])
+        new = [promote(value, inward(like)) for value, like in zip(new, carry, strict=True)]
+        return [_bare(value) for value in new], [_bare(value) for value in out]
+
+    rows = [outward(x) for x in xs]
+    first = jax.tree.map(lambda v: v[0], rows)
+    while True:
+        new = jax.eval_shape(lambda c, r: [_bare(v) for v in turn([inward(x) for x in c], [inward(x) for x in r])[0]],
+                             [_bare(c) for c in carry], first)  # fmt: skip
+        fuller = [promote(c, inward(like)) for c, like in zip(carry, new, strict=True)]
+        if jax.tree.structure(fuller) == jax.tree.structure(carry):
+            break
+        carry = fuller
+    last, ys = jax.lax.scan(step, [_bare(c) for c in carry], rows, length=length, reverse=reverse)
+    return [*(inward(c) for c in last), *(stacked(y) for y in ys)]
+
+
+def _bare(value: Any) -> Any:
+    """A node without the box, which is the same in every turn."""
+    if not is_node(value):
+        return value
+    return value.range, None if value.form is None else (value.form.slope, value.form.offset), value.jac
+
+
+def _unstack(form: Any, jac: Any, box: Any) -> tuple[Any, Any]:
+    swap = jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), jac)
+    return None if form is None else Form(jnp.swapaxes(form[0], 0, 1), form[1], box), swap
+
+
+CALLS: dict[str, Callable[..., Any]] = {"cond": _cond, "scan": _scan} | dict.fromkeys(
+    (
+        "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint",
+        "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
+    ),
+    _call,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _ByHand:
+    natural: Callable[..., Interval]
+    derivative: Callable[..., Any] | None
+
+
+_BY_HAND: dict[str, _ByHand] = {}
+
+
+def register_bounds(name: str, natural: Callable[..., Interval], derivative: Callable[..., Any] | None = None) -> None:
+    """Supply bounds by hand for a primitive, or for a function of your own under ``jax.jit``.
+
+    Args:
+        name: name of the primitive, or of the jitted function (its ``__name__``).
+        natural: takes one `Interval` per argument and returns an `Interval` that contains every value.
+        derivative: for elementwise functions; takes the same and returns one `Interval` per argument (or just one if
+            there is one argument) that contains the derivatives by that argument. Without it the derivative is
+            unknown, ``(-inf, inf)``.
+
+    The affine domain takes slope 0. Registered names come before the built-in table.
+
+    Source: design 5.
+    """
+    if not callable(natural) or not (derivative is None or callable(derivative)):
+        raise ValueError(f"register_bounds: `natural` and `derivative` for {name!r} must be functions of intervals")
+    _BY_HAND[name] = _ByHand(natural, derivative)
+
+
+def _apply_by_hand(bounds: _ByHand, args: Sequence[Any]) -> Node:
+    dtype = next(arg.dtype for arg in args if is_node(arg))
+    nodes = [arg if is_node(arg) else as_node(arg, jnp.shape(arg), dtype) for arg in args]
+    ranges = [node.range for node in nodes]
+    natural = bounds.natural(*ranges)
+    if all(node.jac is None for node in nodes):
+        return Node(natural)
+    if bounds.derivative is None:
+        size = next(node.jac.lower.shape[0] for node in nodes if node.jac is not None)
+        unknown = jnp.full((size, *natural.lower.shape), jnp.inf, natural.lower.dtype)
+        return Node(natural, None, Interval.unchecked(-unknown, unknown))
+    slopes = bounds.derivative(*ranges)
+    slopes = [slopes] if isinstance(slopes, Interval) else list(slopes)
+    jac = None
+    for slope, node in zip(slopes, nodes, strict=True):
+        jac = join(jac, chain(slope, node.jac))
+    return Node(natural, None, jac)

@@ -1,0 +1,185 @@
+"""What the interpreter carries at every node of a function: a range, and for functions of ``x`` more than a range.
+
+Three tiers, from least to most:
+
+- a plain array: the node is a constant, evaluated as usual;
+- a `Node` with a range only: it does not depend on ``x`` (but on an `Interval` argument), or only ranges were asked
+  for. In the affine domain it stands for slope 0, in the derivative domain for derivative 0;
+- a `Node` with a `Form` and, if derivatives were asked for, with an enclosure of its Jacobian.
+
+Inside the engine the axis over the entries of ``x`` comes first, so that slopes broadcast against values.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from gsisio_jax.interval import Interval
+
+
+@jax.custom_jvp
+def times(a: Any, b: Any) -> Any:
+    """``a * b`` with ``0 * inf = 0``; its derivative treats an infinite factor as 0, so gradients stay finite."""
+    product = a * b
+    return jnp.where(jnp.isnan(product), 0, product)
+
+
+@times.defjvp
+def _times_jvp(primals: Any, tangents: Any) -> Any:
+    (a, b), (da, db) = primals, tangents
+    return times(a, b), jnp.where(jnp.isfinite(a), a, 0) * db + jnp.where(jnp.isfinite(b), b, 0) * da
+
+
+class Form(eqx.Module):
+    """``value - slope . x`` lies in ``offset`` for every x of ``box``; slope has shape (n, *shape)."""
+
+    slope: Any
+    offset: Interval
+    box: Interval
+
+    def image(self) -> Interval:
+        """Bounds of the value that follow from the form alone."""
+        return shift(slope_image(self.slope, self.box), self.offset)
+
+
+class Node(eqx.Module):
+    """A value that is not constant: range, and optionally an affine form and a Jacobian enclosure (n, *shape)."""
+
+    range: Interval
+    form: Form | None = None
+    jac: Interval | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.range.lower.shape
+
+    @property
+    def dtype(self) -> Any:
+        return self.range.lower.dtype
+
+    @property
+    def offset(self) -> Interval:
+        """Offset of the form; a node without form has slope 0, so its range."""
+        return self.range if self.form is None else self.form.offset
+
+
+def is_node(value: Any) -> bool:
+    return isinstance(value, Node)
+
+
+def entire_like(value: Any) -> Interval:
+    return Interval.unchecked(jnp.full_like(value, -jnp.inf), jnp.full_like(value, jnp.inf))
+
+
+def choose(mask: Any, a: Interval, b: Interval) -> Interval:
+    """Elementwise `a` where the mask holds, else `b`."""
+    return Interval.unchecked(jnp.where(mask, a.lower, b.lower), jnp.where(mask, a.upper, b.upper))
+
+
+def shift(a: Interval, b: Interval) -> Interval:
+    """Sum of two boxes."""
+    return Interval.unchecked(a.lower + b.lower, a.upper + b.upper)
+
+
+def stretch(factor: Any, a: Interval) -> Interval:
+    """Product of a number and a box."""
+    up = factor >= 0
+    return Interval.unchecked(
+        times(factor, jnp.where(up, a.lower, a.upper)), times(factor, jnp.where(up, a.upper, a.lower))
+    )
+
+
+def product(a: Interval, b: Interval) -> Interval:
+    """Product of two boxes."""
+    p, q = times(a.lower, b.lower), times(a.lower, b.upper)
+    r, s = times(a.upper, b.lower), times(a.upper, b.upper)
+    return Interval.unchecked(
+        jnp.minimum(jnp.minimum(p, q), jnp.minimum(r, s)), jnp.maximum(jnp.maximum(p, q), jnp.maximum(r, s))
+    )
+
+
+def slope_image(slope: Any, box: Interval) -> Interval:
+    """Image of the box (n,) under the slope (n, *shape)."""
+    side = (-1,) + (1,) * (slope.ndim - 1)
+    lower, upper = jnp.reshape(box.lower, side), jnp.reshape(box.upper, side)
+    image = stretch(slope, Interval.unchecked(lower, upper))
+    return Interval.unchecked(image.lower.sum(0), image.upper.sum(0))
+
+
+def guard(a: Interval) -> Interval:
+    """After an overflow: a lower bound is never ``inf``, an upper bound never ``-inf``."""
+    largest = jnp.finfo(a.lower.dtype).max
+    return Interval.unchecked(jnp.minimum(a.lower, largest), jnp.maximum(a.upper, -largest))
+
+
+def meet(node: Node) -> Node:
+    """Intersect the range with what the form says; where rounding makes the two miss each other, keep the range."""
+    if node.form is None:
+        return node
+    natural, image = node.range, node.form.image()
+    lower, upper = jnp.maximum(natural.lower, image.lower), jnp.minimum(natural.upper, image.upper)
+    return Node(choose(lower <= upper, Interval.unchecked(lower, upper), natural), node.form, node.jac)
+
+
+def best_form(slope: Any, offset: Interval, natural: Interval, box: Interval) -> Form:
+    """The form with this slope, or slope 0 with the natural range where that one is narrower."""
+    width = offset.upper - offset.lower
+    good = jnp.isfinite(width) & (width <= natural.upper - natural.lower) & jnp.isfinite(jnp.abs(slope).sum(0))
+    return Form(jnp.where(good, slope, 0), choose(good, offset, natural), box)
+
+
+def settle(node: Node) -> Node:
+    """Last word on the result of every arithmetic rule, in all three domains: the place to widen for rounding."""
+    if not jnp.issubdtype(node.dtype, jnp.floating):
+        return node
+    form, jac = node.form, node.jac
+    if form is not None:
+        form = Form(form.slope, guard(form.offset), form.box)
+    return Node(guard(node.range), form, None if jac is None else guard(jac))
+
+
+def as_node(value: Any, shape: tuple[int, ...], dtype: Any) -> Node:
+    """A constant as a node of one point."""
+    value = jnp.broadcast_to(jnp.asarray(value), shape)
+    value = value if value.dtype == bool else value.astype(dtype)
+    return Node(Interval.unchecked(value, value))
+
+
+def parts(values: Any) -> tuple[Any, Any]:
+    """The box of the forms and the first Jacobian among `values`, or None: which domains a rule has to fill in."""
+    box, jac = None, None
+    for value in values:
+        if is_node(value):
+            box = value.form.box if box is None and value.form is not None else box
+            jac = value.jac if jac is None else jac
+    return box, jac
+
+
+def slope_of(node: Node, box: Interval) -> Any:
+    if node.form is not None:
+        return node.form.slope
+    return jnp.zeros((box.lower.shape[0], *node.shape), node.dtype)
+
+
+def jac_of(node: Node, size: int) -> Interval:
+    if node.jac is not None:
+        return node.jac
+    dtype = node.dtype if jnp.issubdtype(node.dtype, jnp.floating) else jnp.result_type(float)
+    zero = jnp.zeros((size, *node.shape), dtype)
+    return Interval.unchecked(zero, zero)
+
+
+def chain(derivative: Interval, jac: Interval | None) -> Interval | None:
+    """Derivative of an elementwise function times the Jacobian of its argument."""
+    return None if jac is None else product(derivative, jac)
+
+
+def join(a: Interval | None, b: Interval | None) -> Interval | None:
+    """Sum of two Jacobians, absent ones being zero."""
+    if a is None or b is None:
+        return b if a is None else a
+    return shift(a, b)

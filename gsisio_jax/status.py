@@ -1,0 +1,34 @@
+"""What a step reports besides its boxes: a status bit mask, and which intersection was the tightest."""
+
+from __future__ import annotations
+
+import enum
+
+
+class Status(enum.IntFlag):
+    """Bit mask per step and batch element. OK is 0.
+
+    Source: design 4.6.
+    """
+
+    OK = 0
+    CONFLICT = 1  # an intersection is empty: the data contradict the stated bounds (a certified alarm)
+    MISSING = 2  # an entry of y is missing
+    UNBOUNDED = 4  # some side of the state box is infinite
+    OUTSIDE_REGION = 8  # boxes are certain, but the width promise does not apply
+    CROSSED = 16  # prediction form only: the printed recursion lost its order
+
+
+class Source(enum.IntEnum):
+    """Which intersection was the tightest one of a step. The code in a result is ``kind * SOURCE_STRIDE + index``."""
+
+    NONE = 0
+    INITIAL = 1  # initial box against state bounds, by state
+    OUTPUT = 2  # a row of the unknown-input-free output against the box, by row of T2
+    STATE = 3  # box carried from the past (identity (*)) against the box so far, by state
+    DYNAMICS = 4  # x = f + B u + G d + w with the bounds of d, by state
+    INPUT = 5  # bounds of the unknown input against each other, by input
+    CERTIFICATE = 6  # the certified bound, by state
+
+
+SOURCE_STRIDE = 1 << 16

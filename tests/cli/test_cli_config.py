@@ -1,0 +1,78 @@
+"""Every mistake in the configuration is one line that names the file and the key."""
+
+from __future__ import annotations
+
+import pytest
+
+CASES = {
+    "unknown key": ('time = "t"', 'tiem = "t"', ["cart.toml: ", "table.time is missing", "1 more problem"]),
+    "misspelt key": ('missing = [-9999, "n/a"]', "mising = []", ["unknown key table.mising", "did you mean missing?"]),
+    "unknown section": ("[outputs]", "[pictures]", ["unknown key pictures", "keys here are", "outputs"]),
+    "signal key": ('name = "force", unit', 'name = "force", units', ["signals.input[0].units", "did you mean unit?"]),
+    "wrong type": ("sample_time = 0.1", 'sample_time = "0.1"', ["table.sample_time must be a valid number", "'0.1'"]),
+    "sample time": ("sample_time = 0.1", "sample_time = 0", ["table.sample_time must be greater than 0"]),
+    "reference": ("cart_model:cart", "cart_model.cart", ['system.use: must read "module:attribute"']),
+    "module": ("cart_model:cart", "no_such_module:cart", ["system.use: cannot import no_such_module"]),
+    "attribute": ("cart_model:cart", "cart_model:card", ["system.use: cart_model has no attribute card"]),
+    "not a system": ("cart_model:cart", "cart_model:wrong", ["cart_model:wrong returned int, not a System"]),
+    "not callable": ("cart_model:cart", "cart_model:STEP", ["must be a System or a function", "got float"]),
+    "failing system": ("cart_model:cart", "cart_model:broken", ["cart_model:broken failed: KeyError: 'mass'"]),
+    "arguments": ("[signals]", "[system.arguments]\nmass = 1\n[signals]", ["cart failed: TypeError", "'mass'"]),
+    "noise size": (
+        "w = {radius = [0.001, 0.001]}",
+        "w = {radius = [0.001, 0.001, 0.001]}",
+        ["cart.toml: noise.w.radius has 3 values, the system has 2 states"],
+    ),
+    "noise form": ("w = {radius = [0.001, 0.001]}", "w = {lower = [0, 0]}", ["noise.w: needs radius, or both lower"]),
+    "noise twice": ("w = {radius = [0.001, 0.001]}", "w = {radius = [1], lower = [1]}", ["noise.w: give either"]),
+    "noise sign": ("[0.001, 0.001]", "[-0.001, 0.001]", ["noise.w: radius has the negative value -0.001"]),
+    "noise infinite": ("[0.001, 0.001]", "[0.001, inf]", ["Noise"]),
+    "nan": ("lower = [-10.0, -10.0]", "lower = [-10.0, nan]", ["initial.lower[1]: must be a number, not nan"]),
+    "crossed": ("lower = [-10.0, -10.0]", "lower = [-10.0, 11.0]", ["initial: bounds cross at index 1", "lower = 11"]),
+    "lengths": ("lower = [-10.0, -10.0]", "lower = [-10.0]", ["initial: lower has 1 values, upper has 2"]),
+    "initial size": ("10.0]", "10.0, inf]", ["initial"]),
+    "region size": ("upper = [inf, inf]", "upper = [inf]", ["region: lower has 2 values, upper has 1"]),
+    "region auto": ("[region]", "[region]\nauto = true", ["region: give either auto = true or lower and upper"]),
+    "signals": (', {name = "velocity", unit = "m/s"}]', "]", ["signals.state has 1 name, the system has 2 states"]),
+    "same name": ('"velocity", unit', '"position", unit', ["signals.state: the name position is already used"]),
+    "reserved name": ('"force"', '"a/b"', ["signals.input[0].name: must start with a letter"]),
+    "y size": ('y = ["pos", "vel"]', 'y = ["pos"]', ["table.y has 1 column, the system has 2 outputs"]),
+    "u not there": ('y = ["pos"', 'u = ["pos"]\ny = ["pos"', ["table.u has 1 column, the system has no known inputs"]),
+    "u region": ("[initial]", "[u_region]\nradius = [1.0]\n[initial]", ["u_region is given", "no known inputs"]),
+    "file name": ('"boxes.csv"', '"../boxes.csv"', ["outputs.csv: must be a plain file name"]),
+    "same file": ('"boxes.csv"', '"cart.nc"', ["outputs: netcdf, csv and picture must be different files"]),
+    "syntax": ("[noise]", "[noise", ["cart.toml: not valid TOML", "line 8"]),
+    "conflict rule": ("[outputs]", "[estimate]\non_conflict = 'stop'\n[outputs]", ["estimate.on_conflict", "'stop'"]),
+    "gains": ("[outputs]", "[design]\ngains = 0\n[outputs]", ["design.gains must be greater than or equal to 1"]),
+    "draw": ("[outputs]", '[outputs]\ndraw = "cart_model:paint"', ["outputs.draw: cart_model has no attribute paint"]),
+}
+
+
+@pytest.mark.parametrize(("old", "new", "parts"), CASES.values(), ids=CASES.keys())
+def test_a_mistake_is_one_line(project, old, new, parts):
+    project.edit(old, new)
+    project.refused(*parts)
+
+
+def test_design_refuses_the_same_mistakes(project):
+    project.edit("sample_time = 0.1", "")
+    project.refused("cart.toml: table.sample_time is missing", command="design")
+
+
+def test_files_that_are_no_configuration(project):
+    for name, parts in {
+        "nothing.toml": ["nothing.toml: no such file, and no built-in example of that name", "flight"],
+        str(project.folder): ["this is a folder"],
+    }.items():
+        code, out, err = project.run_main("estimate", name, "--out", str(project.out))
+        assert (code, out, err.count("\n")) == (2, "", 1)
+        assert all(part in err for part in parts)
+    (project.folder / "latin.toml").write_bytes(b'title = "caf\xe9"')
+    code, _, err = project.run_main("design", str(project.folder / "latin.toml"))
+    assert (code, err) == (2, "gsisio: latin.toml: not valid TOML: the file is not UTF-8 text\n")
+
+
+def test_debug_shows_the_traceback(project):
+    project.edit("sample_time = 0.1", "")
+    with pytest.raises(ValueError, match=r"table\.sample_time is missing"):
+        project.run("--debug")
