@@ -53,7 +53,9 @@ class Alarm:
             return f"{subject}: the measurement lies {gap} outside of what the box of the state allows"
         if self.kind == "input":
             gap = f"{self.gap:.5g}{_unit(input_units, self.index)}"
-            return f"{_pick(input_names, self.index, 'input')}: the bounds of the unknown input miss each other by {gap}"
+            return (
+                f"{_pick(input_names, self.index, 'input')}: the bounds of the unknown input miss each other by {gap}"
+            )
         name, gap = _pick(state_names, self.index, "state"), f"{self.gap:.5g}{_unit(state_units, self.index)}"
         if self.kind == "initial":
             return f"{name}: the initial box lies {gap} outside of the state bounds"

@@ -172,10 +172,10 @@ def _cast(value: Any, dtype: Any, towards: float) -> Any:
         return jnp.asarray(value)
     if isinstance(value, np.ndarray | np.generic):
         # On the host, before JAX sees the number: with 64-bit types off, JAX itself would round to nearest.
-        with np.errstate(over="ignore"):
+        with np.errstate(all="ignore"):
             cast = np.asarray(value, dtype)
-        wrong = cast > value if towards < 0 else cast < value
-        return jnp.asarray(np.where(wrong, np.nextafter(cast, np.asarray(towards, dtype)), cast))
+            wrong = cast > value if towards < 0 else cast < value
+            return jnp.asarray(np.where(wrong, np.nextafter(cast, np.asarray(towards, dtype)), cast))
     cast = value.astype(dtype)
     if jnp.finfo(dtype).bits >= jnp.finfo(value.dtype).bits:
         return cast
@@ -184,7 +184,9 @@ def _cast(value: Any, dtype: Any, towards: float) -> Any:
     # nextafter has no derivative rule: add its step as a constant, so that gradients see a plain cast.
     fixed = jax.lax.stop_gradient(cast)
     step = jax.lax.stop_gradient(jnp.nextafter(fixed, jnp.asarray(towards, dtype)) - fixed)
-    return jnp.where(wrong & jnp.isfinite(cast), cast + jnp.where(jnp.isfinite(step), step, 0), cast)
+    largest = jnp.finfo(dtype).max if towards < 0 else jnp.finfo(dtype).min
+    moved = jnp.where(jnp.isfinite(fixed), cast + jnp.where(jnp.isfinite(step), step, 0), largest)
+    return jnp.where(wrong, moved, cast)
 
 
 def cast_down(value: Any, dtype: Any) -> Any:
@@ -200,6 +202,7 @@ def cast_up(value: Any, dtype: Any) -> Any:
 @jax.custom_jvp
 def scale(factor: Any, value: Any) -> Any:
     """``factor * value`` with ``0 * inf = 0``, for finite factors; finite gradients even where `value` is infinite."""
+    factor, value = jnp.asarray(factor), jnp.asarray(value)
     return jnp.where(factor == 0, 0, factor * value)
 
 

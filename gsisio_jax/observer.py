@@ -21,6 +21,24 @@ from gsisio_jax.status import Source, Status
 from gsisio_jax.system import Noise, System
 
 
+class FirstSweep(eqx.Module):
+    """How a step begins: with what is known offline of the outputs on the state bounds.
+
+    Attributes:
+        form: affine bounds of T2 g there, or None where g takes u.
+        inverses: ``(I - |N_z| R)^{-1}`` there, for the gains named in `gains`.
+        gains: indices of the gains for which ``|N_z| R`` contracts there.
+        affine_output: T2 g is affine on the state bounds, so psi is zero.
+
+    Source: design 4.3, step 3.
+    """
+
+    form: AffineForm | None
+    inverses: Any
+    gains: tuple[int, ...] = eqx.field(static=True)
+    affine_output: bool = eqx.field(static=True)
+
+
 class Observer(eqx.Module):
     """A designed observer; a pytree whose structure holds f and g. Made by `design_observer`.
 
@@ -33,7 +51,7 @@ class Observer(eqx.Module):
         T2, C: unknown-input-free outputs (q, l) and the slopes chosen for them (q, n).
         bounded_states: (s, n) rows of the identity; bounded_inputs: (b, p).
         region_inverse: ``(I - |N_z| R)^{-1}`` of the first gain on the region (n, n).
-        closed_form: the same for every gain on the state bounds (K, n, n), or None where the first sweep is finite.
+        first: how every step begins.
         current: (p_H, l), ``V1' d = current @ (y - g - D u - v)``.
         current_input_directions: V1 (p, p_H).
         output_rows: for every row of T2 the outputs that enter it.
@@ -50,7 +68,7 @@ class Observer(eqx.Module):
     bounded_states: Any
     bounded_inputs: Any
     region_inverse: Any
-    closed_form: Any
+    first: FirstSweep
     current: Any
     current_input_directions: Any
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
@@ -108,7 +126,7 @@ def begin(
     bounds = observer.system.state_bounds
     z = image(observer.T2, _output_box(observer.system, y, u, noise.v))
     evidence = prior = Evidence(bounds).meet(initial[None], Source.INITIAL)
-    form = _free_output(observer, bounds, u)  # valid on every smaller box: the first sweep serves the fallback too
+    form = _first_form(observer, u)  # valid on every smaller box: the first sweep serves the fallback too
     fallback = prior if hold else strips(Evidence(bounds), form, z)
     for sweep in range(observer.sweeps):
         form = form if sweep == 0 else _free_output(observer, evidence.box, u)
@@ -140,9 +158,7 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
     output = _output_box(system, y, u, noise.v)
     drift = add(_point(system.B @ carry.u), carry.noise.w)
     seen = _output_box(system, carry.y, carry.u, carry.noise.v)
-    shift = Interval.unchecked(
-        jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower])
-    )
+    shift = Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
     terms = Terms(
         shift, output, image(observer.bounded_states, bounds), image(observer.bounded_inputs, system.input_bounds)
     )
@@ -160,14 +176,13 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
     # 3.-5. Contract from the state bounds; y[k] alone first, because a restart begins there.
     z = image(observer.T2, output)
     evidence = alone = Evidence(bounds)
-    form = d = None
+    form, d = _first_form(observer, u), None
     for sweep in range(observer.sweeps):
-        form = _free_output(observer, evidence.box, u)
+        form = form if sweep == 0 or observer.first.affine_output else _free_output(observer, evidence.box, u)
         evidence = strips(evidence, form, z)
         if sweep == 0:
             alone = evidence
-            if observer.closed_form is not None:
-                evidence = _meet_closed_form(observer, evidence, right, u)
+            evidence = _meet_closed_form(observer, evidence, right, u)
         evidence = evidence.meet(solve_remainder(gains, right, form, observer.C), Source.STATE)
         if system.p:
             d, _ = _inputs(observer, evidence, d_fixed, form)
@@ -181,10 +196,15 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
 
 
 def _meet_closed_form(observer: Observer, evidence: Evidence, right: Interval, u: Any) -> Evidence:
-    """Finite bounds where the first sweep has none: the contraction |N_z| R < 1 on the state bounds."""
-    bounds = observer.system.state_bounds
-    for k in range(right.shape[0]):
-        box = centred(right[k], observer.gains.remainder[k], observer.closed_form[k], _psi(observer, u), bounds)
+    """Bounds that need no box to begin with: the contraction |N_z| R < 1 on the state bounds."""
+    for i, k in enumerate(observer.first.gains):
+        box = centred(
+            right[k],
+            observer.gains.remainder[k],
+            observer.first.inverses[i],
+            _psi(observer, u),
+            observer.system.state_bounds,
+        )
         evidence = evidence.meet(box[None], Source.STATE)
     return evidence
 
@@ -293,6 +313,12 @@ def _free_output(observer: Observer, box: Interval, u: Any) -> AffineForm:
     return inclusion.affine(lambda x, u: observer.T2 @ system.measurement(x, u))(box, u)
 
 
+def _first_form(observer: Observer, u: Any) -> AffineForm:
+    """Affine bounds of T2 g on the state bounds."""
+    known = observer.first.form
+    return _free_output(observer, observer.system.state_bounds, u) if known is None else known
+
+
 def _psi(observer: Observer, u: Any) -> Any:
     """The remainder T2 g(x) - C x."""
     return lambda x: observer.T2 @ observer.system.measurement(x, u) - observer.C @ x
@@ -312,4 +338,3 @@ def _inside(box: Interval, region: Interval) -> Any:
 
 def _where(condition: Any, a: Interval, b: Interval) -> Interval:
     return Interval.unchecked(jnp.where(condition, a.lower, b.lower), jnp.where(condition, a.upper, b.upper))
-

@@ -5,42 +5,17 @@ matplotlib is imported when a picture is drawn, never before.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ._extras import need
-from .status import Status
+from ._record import Record, Series, read_record
 
 BAND, EDGE, MEASURED, TRUTH, ALARM, GAP = "#88aadd", "#3366aa", "#bb5500", "#111111", "#cc2233", "#dddddd"
 MAXIMUM_POINTS = 3000
-
-
-@dataclass(frozen=True)
-class _Series:
-    """One panel: a box over time."""
-
-    name: str
-    label: str
-    lower: np.ndarray
-    upper: np.ndarray
-    measured: np.ndarray | None
-
-
-@dataclass(frozen=True)
-class _Record:
-    """All that is drawn, whatever it came from."""
-
-    title: str
-    time: np.ndarray
-    time_label: str
-    series: dict[str, _Series]
-    missing: Any
-    alarms: np.ndarray
 
 
 def framers(
@@ -52,9 +27,10 @@ def framers(
     """Draw the box of every signal over time.
 
     A band is the box; where it fills the panel from edge to edge the signal is not bounded there. Dots are
-    measurements, found by name: those of ``position``, ``position_measured`` or ``measured_position`` belong to the
-    signal ``position``. Grey stretches are rows without any measurement, red lines are certified alarms. An axis shows
-    the ordinary boxes; a few much wider ones (the initial box, say) run out of the panel.
+    measurements, found by name and unit: the outputs ``position``, ``position_sensor`` and ``reported_position`` belong
+    to the signal ``position`` if their units agree. Grey stretches are rows without any measurement, red lines are
+    certified alarms. An axis shows the ordinary boxes; a few much wider ones (the initial box, say) run out of the
+    panel.
 
     Args:
         dataset_or_estimate: result of `dataset.to_dataset`, or of `estimate` on one record.
@@ -70,7 +46,7 @@ def framers(
         MissingExtra: matplotlib is not installed.
     """
     need("matplotlib", extra="plot", purpose="drawing a picture")
-    record = _read(dataset_or_estimate)
+    record = read_record(dataset_or_estimate)
     names = list(record.series) if signals is None else list(signals)
     for name in [*names, *(truth or {})]:
         if name not in record.series:
@@ -108,7 +84,7 @@ def save(dataset_or_estimate: Any, path: str | Path, signals: Sequence[str] | No
         MissingExtra: matplotlib is not installed.
     """
     module = need("matplotlib.figure", extra="plot", purpose="drawing a picture")
-    record = _read(dataset_or_estimate)
+    record = read_record(dataset_or_estimate)
     names = list(record.series) if signals is None else list(signals)
     figure = module.Figure(layout="constrained")
     axes = _layout(figure, len(names))
@@ -155,11 +131,11 @@ def _legend(figure: Any, axes: Any) -> None:
         figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=len(entries), frameon=False)
 
 
-def _panel(axis: Any, record: _Record, series: _Series, truth: Any) -> None:
+def _panel(axis: Any, record: Record, series: Series, truth: Any) -> None:
     time, lower, upper = record.time, series.lower, series.upper
     low, high = _limits(series, truth)
     axis.set_ylim(low, high)
-    axis.set_ylabel(series.label)
+    axis.set_ylabel(_label(series.name, series.unit))
     axis.margins(x=0.01)
     axis.grid(alpha=0.25)
     if record.missing.any():
@@ -194,17 +170,21 @@ def _panel(axis: Any, record: _Record, series: _Series, truth: Any) -> None:
     axis.set_title(_widths(series), loc="right", fontsize="small", color="#444444")
 
 
-def _widths(series: _Series) -> str:
+def _widths(series: Series) -> str:
     width = series.upper - series.lower
     width = width[~np.isnan(width)]
     finite = width[np.isfinite(width)]
     if len(finite) == 0:
         return "never bounded"
-    last = f"last {width[-1]:.3g}" if np.isfinite(width[-1]) else "last not bounded"
-    return f"width: mean {finite.mean():.3g}, median {np.median(finite):.3g}, {last}"
+    last = _short(width[-1]) if np.isfinite(width[-1]) else "not bounded"
+    return f"width: mean {_short(finite.mean())}, median {_short(np.median(finite))}, last {last}"
 
 
-def _limits(series: _Series, truth: Any) -> tuple[float, float]:
+def _short(value: float) -> str:
+    return f"{value:.0f}" if 1e3 <= value < 1e8 else f"{value:.3g}"
+
+
+def _limits(series: Series, truth: Any) -> tuple[float, float]:
     """Axis limits from the ordinary boxes, the measurements and the truth; a few huge boxes do not set the scale."""
     finite = np.isfinite(series.lower) & np.isfinite(series.upper)
     lower, upper = series.lower[finite], series.upper[finite]
@@ -244,54 +224,6 @@ def _runs(time: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, n
     left, right = time[first] - half, time[last] + half
     at = np.stack([left, left, right, right], axis=1).ravel()
     return at, np.zeros(len(at)), np.tile([0.0, 1.0, 1.0, 0.0], len(left))
-
-
-def _read(source: Any) -> _Record:
-    return _read_dataset(source) if hasattr(source, "data_vars") else _read_estimate(source)
-
-
-def _read_dataset(dataset: Any) -> _Record:
-    variables = dataset.data_vars
-    outputs = {name: variables[name].values for name in variables if variables[name].attrs.get("role") == "output"}
-    series = {}
-    for name in variables:
-        signal = variables[name].attrs.get("signal")
-        if signal is None or not str(name).endswith("_lower"):
-            continue
-        unit = variables[name].attrs.get("units", "")
-        matching = (f"measured_{signal}", f"measured_{signal}_measured", f"measured_measured_{signal}")
-        measured = next((outputs[match] for match in matching if match in outputs), None)
-        upper = variables[f"{signal}_upper"].values
-        series[signal] = _Series(signal, _label(signal, unit), variables[name].values, upper, measured)
-    if not series:
-        raise ValueError("framers: the dataset has no variable `<signal>_lower` made by `to_dataset`")
-    missing = (
-        np.isnan(np.stack(list(outputs.values()))).all(axis=0) if outputs else _missing(variables["status"].values)
-    )
-    alarms = np.array([alarm["time"] for alarm in json.loads(dataset.attrs.get("alarms", "[]"))])
-    unit = dataset["time"].attrs.get("units")
-    label = f"time [{unit}]" if unit else "step"
-    return _Record(dataset.attrs.get("title", ""), dataset["time"].values, label, series, missing, alarms)
-
-
-def _read_estimate(est: Any) -> _Record:
-    steps = np.shape(est.state.lower)[0]
-    if np.ndim(est.state.lower) != 2:
-        raise ValueError(f"framers: one record is needed, est.state of shape (T, n), got {np.shape(est.state.lower)}")
-    series = {}
-    for letter, box in (("x", est.state), ("d", est.input)):
-        lower, upper = (np.asarray(side, dtype=np.float64) for side in (box.lower, box.upper))
-        rest = np.full((steps - len(lower), lower.shape[1]), np.nan)
-        lower, upper = np.concatenate([lower, rest]), np.concatenate([upper, rest])
-        for index in range(lower.shape[1]):
-            name = f"{letter}{index + 1}"
-            series[name] = _Series(name, name, lower[:, index], upper[:, index], None)
-    alarms = np.array([float(alarm.step) for alarm in est.alarms()])
-    return _Record("", np.arange(steps, dtype=np.float64), "step", series, _missing(np.asarray(est.status)), alarms)
-
-
-def _missing(status: np.ndarray) -> np.ndarray:
-    return (status & int(Status.MISSING)) != 0
 
 
 def _label(name: str, unit: str) -> str:

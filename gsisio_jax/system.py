@@ -1,7 +1,7 @@
 """The plant: a nonlinear discrete-time system with bounded noise and an unknown input without any bound.
 
-    x[k+1] = f(x[k], u[k]) + B u[k] + G d[k] + w[k]
-    y[k]   = g(x[k], u[k]) + D u[k] + H d[k] + v[k]
+x[k+1] = f(x[k], u[k]) + B u[k] + G d[k] + w[k]
+y[k]   = g(x[k], u[k]) + D u[k] + H d[k] + v[k]
 """
 
 from __future__ import annotations
@@ -225,7 +225,8 @@ def _simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any) -
         total = base + noise_value
         margin = 4 * jnp.finfo(total.dtype).eps * jnp.abs(total)
         held = total - base
-        inner = jnp.clip(noise_value, box.lower + margin, jnp.maximum(box.upper - margin, box.lower + margin))
+        low, high = jnp.minimum(box.lower + margin, box.center), jnp.maximum(box.upper - margin, box.center)
+        inner = jnp.clip(noise_value, low, high)
         total = jnp.where(box.contains(held), total, base + inner)
         return total, total - base
 
@@ -284,7 +285,9 @@ def _known_inputs(B: Any, D: Any, m: int | None, takes_u: bool) -> int:
     if len(sizes) > 1:
         raise ValueError(f"System: B, D and m disagree on the number of known inputs: {sorted(sizes)}")
     if not sizes and takes_u:
-        raise ValueError("System: f or g takes u, but B and D are not given; say how many known inputs there are: m=...")
+        raise ValueError(
+            "System: f or g takes u, but B and D are not given; say how many known inputs there are: m=..."
+        )
     return sizes.pop() if sizes else 0
 
 

@@ -81,7 +81,10 @@ def s4(full_state_measured: bool) -> Case:
     C = np.eye(4) if full_state_measured else np.eye(4)[:2]
     return Case(
         system=gx.System(
-            _s4_f, lambda x: jnp.asarray(C) @ x, G=np.vstack([0.005 * np.eye(2), 0.1 * np.eye(2)]), H=np.zeros((len(C), 2))
+            _s4_f,
+            lambda x: jnp.asarray(C) @ x,
+            G=np.vstack([0.005 * np.eye(2), 0.1 * np.eye(2)]),
+            H=np.zeros((len(C), 2)),
         ),
         noise=gx.Noise(w=ball([1e-3] * 4), v=ball([0.1] * len(C))),
         initial=ball(np.ones(4)),
@@ -223,9 +226,7 @@ def s9() -> Case:
     arena = Interval([-6.0, -5.0, -np.inf], [4.0, 6.0, np.inf])
     return Case(
         system=gx.System(_s9_f, _s9_g, G=G, H=H, state_bounds=arena),
-        noise=gx.Noise(
-            w=ball([0.02] * 3), v=Interval([-0.01, -0.01, -0.02, -0.03], [0.01, 0.02, 0.01, 0.02])
-        ),
+        noise=gx.Noise(w=ball([0.02] * 3), v=Interval([-0.01, -0.01, -0.02, -0.03], [0.01, 0.02, 0.01, 0.02])),
         initial=Interval(start * [0.9, 0.9, 0.8], start * [1.1, 1.1, 1.2]),
         region=Interval([-2.0, -2.0, 0.0], [2.0, 5.0, 12.0]),
         steps=40,

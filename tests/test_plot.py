@@ -57,6 +57,7 @@ def data(est):
         input_names=["leak"],
         input_units=["cm/s"],
         output_names=["left_tank_measured", "right_tank"],
+        output_units=["cm", "cm"],
         y=y,
         title="Two tanks",
     )
@@ -77,6 +78,24 @@ def test_a_dataset_needs_no_arguments(data):
     assert labels == {
         "no measurement", "guaranteed box (full height: not bounded)", "measured", "certified alarm",
     }  # fmt: skip
+
+
+def test_measurements_find_their_signal_by_name_and_unit(est):
+    def drawn(output_names, output_units):
+        data = dataset.to_dataset(
+            est,
+            state_names=["east", "velocity_east"],
+            state_units=["m", "m/s"],
+            input_names=["force"],
+            output_names=output_names,
+            output_units=output_units,
+            y=np.zeros((STEPS, 2)),
+        )
+        axes = plot.framers(data)
+        return ["measured" in axis.get_legend_handles_labels()[1] for axis in axes]
+
+    assert drawn(["reported_velocity_east", "northeast"], ["m/s", "m"]) == [False, True, False]
+    assert drawn(["east", "force"], ["m", "N"]) == [True, False, False]
 
 
 def test_a_huge_first_box_does_not_set_the_scale(data):

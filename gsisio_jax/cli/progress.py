@@ -63,7 +63,9 @@ class DelayedProgress:
 
     def stage(self, description: str, total: int | None = None) -> None:
         """Name what is being done; `total` counts its steps where they can be counted."""
-        self._progress.reset(self._task, description=description, total=total)
+        # A new task, because one that had a total cannot go back to having none.
+        self._progress.remove_task(self._task)
+        self._task = self._progress.add_task(description, total=total)
 
     def advance(self, steps: int) -> None:
         """Count steps that are done."""

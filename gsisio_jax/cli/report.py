@@ -48,7 +48,7 @@ def summarise(
         ("steps", f"{steps}, from {table.time[0]:.10g} s to {table.time[-1]:.10g} s"),
         ("missing rows", f"{whole}" + (f", and {partly} with some entries missing" if partly else "")),
         ("conflicts", _conflicts(table.time[conflicts])),
-        ("unbounded", f"{unbounded} steps with an infinite side" if unbounded else "0 steps"),
+        ("unbounded", f"{unbounded} steps with a state that is not bounded"),
         ("design", f"{outcome.design_seconds:.2f} s"),
         ("compile", f"{outcome.compile_seconds:.2f} s"),
         ("run", f"{outcome.run_seconds:.3g} s, {steps / max(outcome.run_seconds, 1e-9):,.0f} steps/s"),
@@ -61,7 +61,7 @@ def summarise(
     return Summary(
         title=title,
         facts=facts,
-        header=("signal", "mean width", "last width", "certified width", "room in region"),
+        header=("signal", "mean width", "last width", "unbounded steps", "certified width", "room in region"),
         signals=_signals(problem, certificate, dataset),
         alarms=alarms,
         certificate=certificate_lines(certificate, problem),
@@ -106,17 +106,22 @@ def _signals(problem: Problem, certificate: Any, dataset: Any) -> list[Row]:
             width = dataset[f"{name}_upper"].values - dataset[f"{name}_lower"].values
             width = width[~np.isnan(width)]
             finite = width[np.isfinite(width)]
-            promised = f"{steady[index]:.4g}" if certificate.certified else "none"
+            promised = _short(steady[index]) if certificate.certified else "none"
             rows.append(
                 (
                     f"{name} [{unit}]" if unit else name,
-                    f"{finite.mean():.4g}" if len(finite) else "unbounded",
-                    "" if len(width) == 0 else "unbounded" if np.isinf(width[-1]) else f"{width[-1]:.4g}",
+                    _short(finite.mean()) if len(finite) else "unbounded",
+                    "" if len(width) == 0 else "unbounded" if np.isinf(width[-1]) else _short(width[-1]),
+                    str(len(width) - len(finite)),
                     promised,
-                    f"{slack[index]:.4g}" if slack is not None and certificate.certified else "",
+                    _short(slack[index]) if slack is not None and certificate.certified else "",
                 )
             )
     return rows
+
+
+def _short(value: float) -> str:
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
 
 
 def show(summary: Summary, stream: IO[str]) -> None:

@@ -13,7 +13,7 @@ from gsisio_jax.contraction import Bank
 from gsisio_jax.design.enclosures import Slopes, slopes_on
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import Feedthrough, factorise
-from gsisio_jax.design.first_sweep import closed_form_inverses
+from gsisio_jax.design.first_sweep import check_first_sweep, contracting_gains, first_form
 from gsisio_jax.design.gains import improve, optimal_gain, profile_gain
 from gsisio_jax.design.inputs import input_bank
 from gsisio_jax.design.problem import GainProblem, without_rounding
@@ -21,7 +21,7 @@ from gsisio_jax.design.recovery import recovers
 from gsisio_jax.design.region import find_region
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval import Interval
-from gsisio_jax.observer import Observer
+from gsisio_jax.observer import FirstSweep, Observer
 from gsisio_jax.system import Noise, System
 
 _MOST_OUTPUTS_FOR_ALL_PATTERNS = 4  # 2^4 patterns of missing entries get a gain each; beyond, one entry at a time
@@ -82,12 +82,20 @@ def design_observer(
     if missing:
         bank.extend(_gains_for_missing(problem, main, region, feedthrough))
     bank = _distinct(bank)
-    bank, closed_form = closed_form_inverses(system, problem, bank, everywhere, u_region)
+    first = first_form(system, feedthrough.T2, u_region)
+    contracting = contracting_gains(problem, bank, everywhere)
+    check_first_sweep(problem, bank[0], first, contracting[0] is not None)
     steady = problem.steady_width(bank[0])
     width = _units(steady) if np.isfinite(steady).all() else _typical_width(problem, region)
     # Where f and g are affine no enclosure depends on the region, so there is no region to leave.
     promised_on = region if not everywhere.affine else Interval.entire(system.n)
-    observer = _assemble(plan, problem, promised_on, bank, closed_form, input_bank(problem, width), sweeps)
+    start = FirstSweep(
+        form=None if system.g_takes_u else first,
+        inverses=np.array([inverse for inverse in contracting if inverse is not None]).reshape(-1, system.n, system.n),
+        gains=tuple(k for k, inverse in enumerate(contracting) if inverse is not None),
+        affine_output=not everywhere.Z_radius.any(),
+    )
+    observer = _assemble(plan, problem, promised_on, bank, start, input_bank(problem, width), sweeps)
     if not missing:
         return observer
     certificate = replace(observer.certificate, recoverable=recovers(observer, width, u_region))
@@ -140,7 +148,9 @@ def _check(
         raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
     for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
         if box.shape != (size,):
-            raise ValueError(f"design_observer: the noise bounds of `{name}` must have shape ({size},), got {box.shape}")
+            raise ValueError(
+                f"design_observer: the noise bounds of `{name}` must have shape ({size},), got {box.shape}"
+            )
     if isinstance(region, str) and region == "auto":
         region = None
     elif not isinstance(region, Interval) or region.shape != (system.n,):
@@ -245,7 +255,9 @@ def _distinct(bank: list[np.ndarray]) -> list[np.ndarray]:
     """Drop gains that repeat an earlier one; keep the first, certified one in front."""
     kept: list[np.ndarray] = []
     for gain in bank:
-        if not any(np.allclose(gain, other, rtol=1e-7, atol=1e-12) and ((gain != 0) == (other != 0)).all() for other in kept):
+        if not any(
+            np.allclose(gain, other, rtol=1e-7, atol=1e-12) and ((gain != 0) == (other != 0)).all() for other in kept
+        ):
             kept.append(gain)
     return kept
 
@@ -269,7 +281,7 @@ def _assemble(
     problem: GainProblem,
     region: Interval,
     bank: list[np.ndarray],
-    closed_form: np.ndarray | None,
+    start: FirstSweep,
     inverses: Bank,
     sweeps: int,
 ) -> Observer:
@@ -280,9 +292,7 @@ def _assemble(
     J1, J2 = -inverses.residual[0][:, : problem.n], -inverses.residual[0][:, problem.n :]
     growth, implicit = problem.growth(main), problem.implicit(main)
     steady = problem.steady_width(main)
-    before = (
-        np.abs(J1 @ problem.F + J2 @ problem.E) + np.abs(J1) @ problem.F_radius + np.abs(J2) @ problem.E_radius
-    )
+    before = np.abs(J1 @ problem.F + J2 @ problem.E) + np.abs(J1) @ problem.F_radius + np.abs(J2) @ problem.E_radius
     certified = bool(np.isfinite(steady).all())
     input_width = np.full(len(J1), np.inf)
     if certified:
@@ -328,10 +338,9 @@ def _assemble(
         bounded_states=problem.C[q:],
         bounded_inputs=np.eye(problem.G.shape[1])[~problem.free],
         region_inverse=region_inverse,
-        closed_form=closed_form,
+        first=start,
         current=feedthrough.current,
         current_input_directions=feedthrough.V1,
         output_rows=tuple(tuple(int(j) for j in np.flatnonzero(row)) for row in feedthrough.T2),
         sweeps=sweeps,
     )
-

@@ -51,7 +51,9 @@ def _direct(problem: GainProblem, width: np.ndarray, use_y: bool) -> np.ndarray 
     n, p = problem.n, problem.G.shape[1]
     J = cp.Variable((p, n + problem.l))
     J1, J2 = J[:, :n], J[:, n:]
-    cost = cp.abs(J1) @ (width + problem.dw + problem.F_radius @ width) + cp.abs(J1 @ problem.F + J2 @ problem.E) @ width
+    cost = (
+        cp.abs(J1) @ (width + problem.dw + problem.F_radius @ width) + cp.abs(J1 @ problem.F + J2 @ problem.E) @ width
+    )
     cost = cost + cp.abs(J2) @ (problem.E_radius @ width + problem.dv)
     usable = np.concatenate([np.full(n, True), np.full(problem.l, use_y)])
     return _solve(J, cost, np.vstack([problem.G, problem.H]), problem, usable)

@@ -98,7 +98,11 @@ class GainProblem:
         P = np.eye(self.n) - N[:, self.l :] @ self.C
         known = np.abs(self.residual(N)[:, ~self.free]) @ self.dd
         return (
-            np.abs(P) @ self.dw + np.abs(N_y) @ self.dv + np.abs(N_z @ self.T2) @ self.dv + np.abs(N_s) @ self.ds + known
+            np.abs(P) @ self.dw
+            + np.abs(N_y) @ self.dv
+            + np.abs(N_z @ self.T2) @ self.dv
+            + np.abs(N_s) @ self.ds
+            + known
         )
 
     def row_cost(self, N: np.ndarray, width: np.ndarray) -> np.ndarray:

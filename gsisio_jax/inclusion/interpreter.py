@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from gsisio_jax.inclusion import linear, logic
 from gsisio_jax.inclusion.node import Form, Node, as_node, chain, is_node, jac_of, join, parts, settle, slope_of
-from gsisio_jax.inclusion.table import ARITHMETIC, LIBRARY, MOVES, UnknownPrimitiveError
+from gsisio_jax.inclusion.table import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, UnknownPrimitiveError
 from gsisio_jax.interval import Interval
 
 # Longer loops are kept as loops: compile time grows with every unrolled turn.
@@ -55,8 +55,9 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
         return CALLS[name](eqn, *args)
     if name in MOVES:
         return MOVES[name](eqn, *args)
-    if name in ARITHMETIC:
-        value = ARITHMETIC[name](eqn, *(args if name == "dot_general" else _aligned(args, eqn.outvars[0].aval.shape)))
+    if name in REDUCTIONS or name in ELEMENTWISE:
+        aligned = args if name in REDUCTIONS else _aligned(args, eqn.outvars[0].aval.shape)
+        value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
         return settle(value) if is_node(value) else value
     raise UnknownPrimitiveError(name)
 
@@ -92,7 +93,7 @@ def _call(eqn: Any, *args: Any) -> Any:
     jaxpr, consts = _body(eqn)
     name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
     if name in LIBRARY and source.startswith(_JAX) and any(is_node(arg) for arg in args):
-        return [settle(LIBRARY[name](eqn, *args))]
+        return [settle(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
     return evaluate(jaxpr, consts, args)
 
 

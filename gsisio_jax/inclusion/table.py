@@ -141,7 +141,8 @@ def _truth_reduce(fn: Callable[..., Any]) -> Rule:
     return rule
 
 
-ARITHMETIC: dict[str, Rule] = {
+# Entry by entry; a scalar operand has been spread to the shape of the result.
+ELEMENTWISE: dict[str, Rule] = {
     "add": _plain(linear.add),
     "add_any": _plain(linear.add),
     "sub": _sub,
@@ -152,7 +153,6 @@ ARITHMETIC: dict[str, Rule] = {
     "pow": _plain(bilinear.raise_to),
     "integer_pow": lambda eqn, x: bilinear.integer_power(x, eqn.params["y"]),
     "atan2": _plain(bilinear.angle),
-    "dot_general": lambda eqn, x, y: bilinear.dot(x, y, eqn.params["dimension_numbers"], _same(eqn)),
     "max": _plain(logic.maximum),
     "min": _plain(logic.minimum),
     "clamp": _plain(logic.clamp),
@@ -173,6 +173,10 @@ ARITHMETIC: dict[str, Rule] = {
     "is_finite": _plain(logic.finite),
     "select_n": _plain(logic.select),
     "convert_element_type": _convert,
+}
+# Across entries.
+REDUCTIONS: dict[str, Rule] = {
+    "dot_general": lambda eqn, x, y: bilinear.dot(x, y, eqn.params["dimension_numbers"], _same(eqn)),
     "reduce_sum": lambda eqn, x: linear.total(x, eqn.params["axes"]),
     "reduce_max": _reduce(logic.maximum),
     "reduce_min": _reduce(logic.minimum),
@@ -186,7 +190,7 @@ ARITHMETIC: dict[str, Rule] = {
     "scatter_add": _structural(0, 2),
     "cumsum": _structural(),
 }
-ARITHMETIC |= {name: _curve(name) for name in curves.CURVES}
+ELEMENTWISE |= {name: _curve(name) for name in curves.CURVES}
 # Results of these need no widening: they only move numbers about, or their insides have been through it.
 MOVES: dict[str, Rule] = {
     name: _structural(*data)
@@ -195,6 +199,7 @@ MOVES: dict[str, Rule] = {
         "reshape": (0,),
         "squeeze": (0,),
         "expand_dims": (0,),
+        "tile": (0,),
         "transpose": (0,),
         "rev": (0,),
         "copy": (0,),
@@ -219,4 +224,6 @@ MOVES: dict[str, Rule] = {
 LIBRARY: dict[str, Rule] = {
     "logaddexp": _plain(logic.log_add_exp),
     "remainder": _plain(logic.floored_remainder),
+    "floor_divide": lambda eqn, x, y: logic.staircase(jnp.floor, -1.0, 0.0)(bilinear.divide(x, y)),
+    "trunc": _plain(logic.truncate),
 }

@@ -80,7 +80,16 @@ def test_summary_says_it_all(project):
     assert "steps 40, from 0 s to 3.9 s" in lines
     assert "missing rows 2, and 1 with some entries missing" in lines
     assert "conflicts 1, at 2.5 s" in lines
-    for word in ("steps/s", "position [m]", "velocity [m/s]", "force [N]", "mean width", "last width", "certificate"):
+    for word in (
+        "steps/s",
+        "position [m]",
+        "velocity [m/s]",
+        "force [N]",
+        "mean width",
+        "last width",
+        "unbounded steps",
+        "certificate",
+    ):
         assert word in out
     alarm = next(line for line in lines if line.startswith("2.5 s: "))
     assert any(unit in alarm for unit in (" m", " N"))

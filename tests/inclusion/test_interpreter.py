@@ -1,0 +1,259 @@
+"""The engine inside jit, vmap, grad and scan; types; errors and bounds supplied by hand."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from gsisio_jax import inclusion
+from gsisio_jax.interval import Interval
+
+BOUNDS = (inclusion.natural, inclusion.affine, inclusion.jacobian, inclusion.mean_value)
+
+
+def tanks(x):
+    """Six tanks in a row: outflow by the root of the level."""
+    s, h, k = 19.62**0.5, 0.5, 0.015
+    r = jnp.sqrt(x)
+    flow = jnp.concatenate([jnp.array([0.1]), h * k * s * r[:-1]])
+    return x + flow - h * k * s * r
+
+
+def robot(x):
+    px, py, th = x
+    near = jnp.sqrt((5 - px) ** 2 + (15 - py) ** 2)
+    return jnp.stack([px + 0.3 * jnp.cos(th), py + 0.3 * jnp.sin(th), near, th - jnp.arctan((15 - py) / (5 - px))])
+
+
+def busy(x):
+    """A bit of everything that has kinks, ties, poles or flat ends."""
+    return jnp.stack([
+        jnp.sin(x[0]) * x[1] + jnp.sqrt(x[1]), jnp.tanh(x[0]) + jnp.exp(x[1]), x[0] / jnp.abs(x[1]),
+        jnp.max(x) + jax.nn.relu(x[0]), jnp.arctan2(x[0], x[1]), jnp.log(x[0]) * x[1] + x[0] ** 3,
+        jnp.where(x[0] > 0, x[0], x[1]), jnp.linalg.norm(x), jnp.clip(x[0], -1, 1) + jnp.floor(x[1]),
+        jnp.arcsin(x[0]) + x[1] ** 0.3 + jnp.mod(x[0], 2.0), jnp.logaddexp(x[0], x[1]) + jnp.tan(x[0]) + jnp.cbrt(x[0]),
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.__name__)
+def test_jit_and_vmap_equal_a_loop(bound):
+    rng = np.random.default_rng(1)
+    lower = np.array([2.0, 12.0, 0.1]) + rng.uniform(-1, 1, (5, 3))
+    boxes = Interval(lower, lower + rng.uniform(0, 0.5, (5, 3)))
+    call = jax.jit(bound(robot))
+    batch = jax.jit(jax.vmap(bound(robot)))(boxes)
+    for i in range(5):
+        one, plain = call(boxes[i]), bound(robot)(boxes[i])
+        for a, b, c in zip(*(jax.tree.leaves(v) for v in (batch, one, plain)), strict=True):
+            np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(b, c, rtol=1e-12, atol=1e-12)
+
+
+def test_vmap_over_an_argument():
+    f = lambda x, a: jnp.sin(a * x)  # noqa: E731
+    box, a = Interval([-1.0, 0.0], [1.0, 2.0]), jnp.array([0.5, 1.0, 3.0])
+    batch = jax.vmap(inclusion.affine(f), in_axes=(None, 0))(box, a)
+    for i in range(3):
+        one = inclusion.affine(f)(box, a[i])
+        for p, q in zip(jax.tree.leaves(batch), jax.tree.leaves(one), strict=True):
+            np.testing.assert_allclose(p[i], q, rtol=1e-14, atol=1e-15)
+
+
+def test_inside_a_scan():
+    def step(box, _):
+        box = inclusion.natural(lambda x: 0.5 * jnp.sin(x) + 0.1)(box)
+        return box, box
+
+    last, track = lax.scan(step, Interval(jnp.array([-1.0]), jnp.array([1.0])), None, length=20)
+    assert track.shape == (20, 1)
+    assert last.width < 1e-4
+
+
+def test_one_trace_for_all_numbers():
+    count = 0
+
+    def f(x):
+        nonlocal count
+        count += 1
+        return jnp.sin(x)
+
+    call = jax.jit(inclusion.affine(f))
+    for i in range(3):
+        call(Interval(np.array([float(i)]), np.array([i + 1.0])))
+    assert count == 1
+
+
+SIDES = {
+    "finite": ([-1.0, 0.5], [0.4, 1.5]),
+    "touching 0": ([0.0, 0.0], [0.7, 2.0]),
+    "zero width": ([0.3, 0.6], [0.3, 0.6]),
+    "zero width at 0": ([0.0, 0.0], [0.0, 0.0]),
+    "entire": ([-np.inf, -np.inf], [np.inf, np.inf]),
+    "half": ([-1.0, -np.inf], [np.inf, 0.0]),
+    "tiny": ([1e-12, -1e-12], [2e-12, 1e-12]),
+    "huge": ([-1e200, -1e300], [1e200, 1e300]),
+    "outside": ([-3.0, -2.0], [-2.5, -1.0]),
+}
+
+
+@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.__name__)
+def test_gradients_are_finite(bound):
+    @jax.jit
+    def gradients(lower, upper):
+        def total(lower, upper):
+            leaves = jax.tree.leaves(bound(busy)(Interval.unchecked(lower, upper)))
+            # Each output on its own, so that inf - inf in the sum hides nothing.
+            return jnp.concatenate([leaf.ravel() for leaf in leaves])
+
+        return jax.jacrev(total, argnums=(0, 1))(lower, upper)
+
+    for name, (lower, upper) in SIDES.items():
+        for gradient in gradients(jnp.array(lower), jnp.array(upper)):
+            assert np.isfinite(gradient).all(), name
+
+
+@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.__name__)
+def test_gradients_match_finite_differences(bound):
+    f = lambda x, a: jnp.stack([  # noqa: E731
+        jnp.sin(a * x[0]) * x[1], jnp.sqrt(x[1]) + jnp.tanh(x[0]), jnp.exp(x[0]) / x[1], jnp.arctan2(x[0], x[1]),
+        jnp.log(x[1]) - x[0] ** 3, jnp.maximum(x[0], 0.1 * x[1]), jnp.abs(x[0]) + x[1] * x[1],
+        jnp.cos(3 * x[0] + a) + 1 / x[1], jnp.linalg.norm(x), jnp.arctan(x[0] - a),
+    ])  # fmt: skip
+
+    @jax.jit
+    def flat(p):
+        box = Interval.unchecked(p[:2], p[2:4])
+        out = bound(f)(box, p[4])
+        return jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(out)])
+
+    p = jnp.array([-0.43, 0.71, 0.29, 1.37, 0.83])
+    exact = np.asarray(jax.jacrev(flat)(p))
+    step = 1e-6
+    for i in range(5):
+        e = np.zeros(5)
+        e[i] = step
+        difference = (np.asarray(flat(p + e)) - np.asarray(flat(p - e))) / (2 * step)
+        np.testing.assert_allclose(exact[:, i], difference, atol=2e-8 / step * 1e-6 + 1e-7, rtol=1e-6)
+
+
+def test_float32_in_float32_out():
+    box = Interval(np.array([-1, 0.5], np.float32), np.array([1, 2], np.float32))
+    for bound in BOUNDS:
+        for leaf in jax.tree.leaves(bound(busy)(box)):
+            assert leaf.dtype == jnp.float32
+            assert not np.isnan(leaf).any()
+    x = np.random.default_rng(0).uniform(box.lower, box.upper, (200, 2))
+    value = np.asarray(jax.vmap(robot_like)(x))
+    form = inclusion.affine(robot_like)(box)
+    assert (form.range.lower - 1e-5 <= value).all()
+    assert (value <= form.range.upper + 1e-5).all()
+
+
+def robot_like(x):
+    return jnp.stack([jnp.sin(x[0]) * x[1], jnp.sqrt(x[1]) / 3])
+
+
+def test_type_is_that_of_box_and_arguments():
+    box32 = Interval(np.zeros(1, np.float32), np.ones(1, np.float32))
+    f = lambda x, a: a * x  # noqa: E731
+    assert inclusion.natural(f)(box32, jnp.float64(2)).dtype == jnp.float64
+    assert inclusion.natural(f)(box32, 2.0).dtype == jnp.float32
+    assert inclusion.natural(f)(box32, 2).dtype == jnp.float32
+    assert inclusion.natural(f)(box32, Interval(np.zeros(1), np.ones(1))).dtype == jnp.float64
+    third = Interval([1 / 3], [1 / 3]).astype(jnp.float32)
+    assert inclusion.natural(lambda x: x)(Interval([1 / 3], [1 / 3])).lower.dtype == jnp.float64
+    assert third.width > 0
+
+
+def test_unknown_operation_is_named_with_its_place():
+    def f(x):
+        return jnp.sort(x) + 1  # the line to be named
+
+    line = f.__code__.co_firstlineno + 1
+    with pytest.raises(inclusion.UnknownPrimitiveError, match=rf"`sort`.*test_interpreter\.py:{line}.*register_bounds"):
+        inclusion.natural(f)(Interval([0.0, 1.0], [1.0, 2.0]))
+    with pytest.raises(inclusion.UnknownPrimitiveError, match="dynamic_slice.*indices that depend on the box"):
+        inclusion.natural(lambda x: lax.dynamic_slice(x, (x[0].astype(int),), (1,)))(Interval([0.0, 1.0], [1.0, 2.0]))
+    # What does not depend on the box needs no bounds.
+    assert inclusion.natural(lambda x, a: x + jnp.sort(a)[0])(Interval([0.0], [1.0]), jnp.array([3.0, 2.0])).lower == 2
+
+
+def test_bounds_by_hand_for_a_primitive_and_for_a_function():
+    box = Interval([2.0], [3.0])
+    with pytest.raises(inclusion.UnknownPrimitiveError, match="lgamma"):
+        inclusion.natural(lax.lgamma)(box)
+    inclusion.register_bounds(
+        "lgamma",
+        lambda x: Interval.unchecked(lax.lgamma(x.lower), lax.lgamma(x.upper)),
+        lambda x: Interval.unchecked(lax.digamma(x.lower), lax.digamma(x.upper)),
+    )
+    bounds = inclusion.natural(lambda x: 2 * lax.lgamma(x))(box)
+    np.testing.assert_allclose([bounds.lower[0], bounds.upper[0]], [0, 2 * np.log(2)], atol=1e-12)
+    jac = inclusion.jacobian(lambda x: lax.lgamma(2 * x))(Interval([1.0], [1.5]))
+    np.testing.assert_allclose([jac.lower[0, 0], jac.upper[0, 0]], 2 * np.array([0.42278433, 0.92278433]), rtol=1e-7)
+
+    @jax.jit
+    def sorted_entries(x):
+        return jnp.sort(x)
+
+    inclusion.register_bounds(
+        "sorted_entries", lambda x: Interval.unchecked(jnp.sort(x.lower), jnp.sort(x.upper))
+    )
+    pair = Interval([0.0, 1.0], [5.0, 2.0])
+    form = inclusion.affine(lambda x: sorted_entries(x) + x)(pair)
+    np.testing.assert_array_equal(form.slope, np.eye(2))
+    np.testing.assert_array_equal(form.offset.upper, [2, 5])
+    assert np.isinf(inclusion.jacobian(sorted_entries)(pair).upper).all()
+    with pytest.raises(ValueError, match="must be functions"):
+        inclusion.register_bounds("lgamma", None)
+
+
+@pytest.mark.parametrize("box", [np.zeros(2), Interval(0.0, 1.0), Interval(np.zeros((2, 2)), np.ones((2, 2)))])
+def test_a_box_of_another_shape_is_refused(box):
+    for bound in BOUNDS:
+        with pytest.raises(ValueError, match=rf"{bound.__name__}: .*Interval of shape \(n,\)"):
+            bound(lambda x: x)(box)
+
+
+def test_long_scan_equals_the_unrolled_one():
+    def turn(c, a):
+        level, count = c
+        level = 0.9 * level + 0.1 * jnp.sin(level) * a
+        return (level, count + 1), level[0] + count
+
+    f = lambda x: lax.scan(turn, (x, 0.0), x[0] * jnp.arange(30.0) / 30)  # noqa: E731
+    g = lambda x: lax.scan(turn, (x, 0.0), x[0] * jnp.arange(30.0) / 30, unroll=30)  # noqa: E731
+
+    def by_hand(x):
+        c, out = (x, 0.0), []
+        for a in x[0] * jnp.arange(30.0) / 30:
+            c, y = turn(c, a)
+            out.append(y)
+        return c, jnp.stack(out)
+
+    box = Interval([0.2, -0.4], [0.5, 0.1])
+    for bound in (inclusion.natural, inclusion.affine, inclusion.jacobian):
+        for other in (g, by_hand):
+            for a, b in zip(jax.tree.leaves(bound(f)(box)), jax.tree.leaves(jax.jit(bound(other))(box)), strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-13)
+
+
+def test_gradient_rules_of_a_function_are_ignored():
+    @jax.custom_jvp
+    def twice(x):
+        return 2 * x
+
+    twice.defjvp(lambda primals, tangents: (twice(*primals), 77 * tangents[0]))
+    assert inclusion.jacobian(twice)(Interval([0.0], [1.0])).upper == 2
+
+
+def test_six_tanks_are_bounded_tightly():
+    box = Interval(np.full(6, 16.0), np.full(6, 24.0))
+    form = jax.jit(inclusion.affine(tanks))(box)
+    assert form.offset.width.max() < 5e-3
+    jac = inclusion.jacobian(tanks)(box)
+    assert (np.diag(jac.lower) > 0.99).all()
+    assert np.isfinite(jax.jit(inclusion.affine(tanks))(Interval(np.zeros(6), np.full(6, 24.0))).offset.width).all()
