@@ -1,4 +1,4 @@
-"""Guaranteed boxes for the state and the unknown input of a nonlinear system: a JAX-compiled batch interval observer."""
+"""Guaranteed boxes for the state and the unknown input of a nonlinear system: a compiled batch interval observer."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -14,9 +14,8 @@ from gsisio_jax.system import Noise
 class Certificate(eqx.Module):
     """The width promise of a design, and everything needed to check it.
 
-    As long as two successive boxes of the state lie in `region` (anywhere, where f and g are affine there and the region
-    is all of R^n) and no measurement is missing, the widths obey ``next_width``, and so settle at or below
-    `steady_width`.
+    As long as two successive boxes of the state lie in `region` (anywhere, where f and g are affine) and no measurement
+    is missing, the widths obey ``next_width``, and so settle at or below `steady_width`.
 
     Attributes:
         certified: the width recursion contracts (`rate` < 1).
@@ -85,9 +84,9 @@ class Certificate(eqx.Module):
         return noise.w.width @ self.noise_w.T + noise.v.width @ self.noise_v.T + self.noise_fixed
 
     def next_width(self, width: Any, noise: Noise) -> Any:
-        """The recursion ``(I - |N_z| R)^{-1} (A width + b)``, (n,)."""
+        """The recursion ``(I - |N_z| R)^{-1} (A width + b)``, (n,) or a stack (..., n)."""
         inverse = np.linalg.inv(np.eye(len(self.growth)) - np.asarray(self.implicit))
-        return inverse @ (self.growth @ width + self.noise_width(noise))
+        return (width @ self.growth.T + self.noise_width(noise)) @ inverse.T
 
     def widths(self, noise: Noise) -> Any:
         """Steady width (n,) for other noise bounds; all ``inf`` if the recursion does not contract."""
@@ -100,9 +99,9 @@ class Certificate(eqx.Module):
         return self.input_width_after(self.widths(noise), self.widths(noise), noise)
 
     def input_width_after(self, now: Any, before: Any, noise: Noise) -> Any:
-        """Width of the box of d[k-1] from the state widths at k and k-1."""
+        """Width of the box of d[k-1] from the state widths at k and k-1, (p,) or a stack (..., p)."""
         known = noise.w.width @ self.input_state_now.T + noise.v.width @ self.input_noise_v.T
-        return self.input_state_now @ now + self.input_state_before @ before + known
+        return now @ self.input_state_now.T + before @ self.input_state_before.T + known
 
     def __str__(self) -> str:
         lines = [self._headline()]

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -158,6 +157,8 @@ def strips(evidence: Evidence, form: AffineForm, z: Interval) -> Evidence:
     Source: design 4.3, step 4.
     """
     box, slope, offset = evidence.box, form.slope, form.offset
+    if not slope.shape[0]:
+        return evidence  # d reaches every output: none of them is free of it
     at_lower, at_upper = scale(slope, box.lower), scale(slope, box.upper)
     low, high = jnp.minimum(at_lower, at_upper), jnp.maximum(at_lower, at_upper)  # (q, n)
     reach = intersect(Interval.unchecked(low.sum(-1) + offset.lower, high.sum(-1) + offset.upper), form.range)[0]

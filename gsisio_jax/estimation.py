@@ -13,7 +13,8 @@ import numpy as np
 
 from gsisio_jax.alarms import Alarm, read_alarms
 from gsisio_jax.interval import Interval, is_concrete
-from gsisio_jax.observer import Carry, Observer, StepOutput, advance as _advance, begin
+from gsisio_jax.observer import Carry, Observer, StepOutput, begin
+from gsisio_jax.observer import advance as _advance
 from gsisio_jax.system import Noise
 
 OnConflict = Literal["restart", "hold"]

@@ -14,12 +14,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 
 def is_concrete(value: Any) -> bool:
     """True where the numbers of an array can be looked at (no tracer)."""
-    return not isinstance(value, jax.core.Tracer)
+    return not isinstance(value, Tracer)
 
 
 def _as_float_array(value: Any, call: str, name: str) -> Any:
@@ -172,9 +173,10 @@ def _cast(value: Any, dtype: Any, towards: float) -> Any:
         return jnp.asarray(value)
     if isinstance(value, np.ndarray | np.generic):
         # On the host, before JAX sees the number: with 64-bit types off, JAX itself would round to nearest.
+        exact: Any = value
         with np.errstate(all="ignore"):
-            cast = np.asarray(value, dtype)
-            wrong = cast > value if towards < 0 else cast < value
+            cast = np.asarray(exact, dtype)
+            wrong = cast > exact if towards < 0 else cast < exact
             return jnp.asarray(np.where(wrong, np.nextafter(cast, np.asarray(towards, dtype)), cast))
     cast = value.astype(dtype)
     if jnp.finfo(dtype).bits >= jnp.finfo(value.dtype).bits:

@@ -51,6 +51,7 @@ class Observer(eqx.Module):
         T2, C: unknown-input-free outputs (q, l) and the slopes chosen for them (q, n).
         bounded_states: (s, n) rows of the identity; bounded_inputs: (b, p).
         region_inverse: ``(I - |N_z| R)^{-1}`` of the first gain on the region (n, n).
+        u_region: box (m,) of known inputs for which the enclosures hold; all of R^m where f and g do not take u.
         first: how every step begins.
         current: (p_H, l), ``V1' d = current @ (y - g - D u - v)``.
         current_input_directions: V1 (p, p_H).
@@ -68,6 +69,7 @@ class Observer(eqx.Module):
     bounded_states: Any
     bounded_inputs: Any
     region_inverse: Any
+    u_region: Interval
     first: FirstSweep
     current: Any
     current_input_directions: Any
@@ -145,7 +147,7 @@ def advance(
     evidence, fallback, d = _contract(observer, carry, y, u, noise)
     if hold:
         fallback, _, _ = _contract(observer, carry, jnp.full_like(y, jnp.nan), u, noise)
-    return _finish(observer, evidence, fallback, carry.state, d, y, u, noise, hold)
+    return _finish(observer, evidence, fallback, carry, d, y, u, noise, hold)
 
 
 def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[Evidence, Evidence, Interval]:
@@ -170,7 +172,8 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), gains.flat(), inverses.flat())
     bound = both.explicit(h, before, terms)[0]
     right = Interval.unchecked(*(x[: gains.rows].reshape(-1, n) for x in (bound.lower, bound.upper)))
-    d_fixed = Interval.unchecked(*(x[gains.rows :].reshape(-1, system.p) for x in (bound.lower, bound.upper)))
+    shape = inverses.residual.shape[:2]
+    d_fixed = Interval.unchecked(*(x[gains.rows :].reshape(shape) for x in (bound.lower, bound.upper)))
     f_now = add(h.range[:n], drift)
 
     # 3.-5. Contract from the state bounds; y[k] alone first, because a restart begins there.
@@ -205,6 +208,7 @@ def _meet_closed_form(observer: Observer, evidence: Evidence, right: Interval, u
             _psi(observer, u),
             observer.system.state_bounds,
         )
+        box = _where(_in_u_region(observer, u), box, _entire(box))
         evidence = evidence.meet(box[None], Source.STATE)
     return evidence
 
@@ -218,6 +222,7 @@ def _certified(
         return evidence, jnp.asarray(False)
     region = certificate.region
     inside = _inside(before, region) & _inside(evidence.box, region)
+    inside = inside & _in_u_region(observer, u_before) & _in_u_region(observer, u)
     # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
     c = jnp.where(inside, before.center, region.center)
     gain, system = jax.tree.map(lambda x: x[0], observer.gains), observer.system
@@ -263,7 +268,7 @@ def _finish(
     observer: Observer,
     evidence: Evidence,
     fallback: Evidence,
-    before: Interval | None,
+    carry: Carry | None,
     d: Interval | None,
     y: Any,
     u: Any,
@@ -284,14 +289,18 @@ def _finish(
     seen = image(observer.current, _output_box(system, y_kept, u, noise.v))
     current_input = add(seen, direct.range)
 
-    inside = _inside(state, certificate.region)
-    if before is not None:
-        inside = inside & _inside(before, certificate.region)
+    applies = _in_u_region(observer, u)
+    if carry is not None:
+        applies = applies & _in_u_region(observer, carry.u)
+    if certificate.region_matters:
+        applies = applies & _inside(state, certificate.region)
+        if carry is not None:
+            applies = applies & _inside(carry.state, certificate.region)
     bits = (
         (conflict, Status.CONFLICT),
         (jnp.isnan(y).any(), Status.MISSING),
         (~(jnp.isfinite(state.lower) & jnp.isfinite(state.upper)).all(), Status.UNBOUNDED),
-        (~inside & certificate.region_matters, Status.OUTSIDE_REGION),
+        (~applies, Status.OUTSIDE_REGION),
     )
     status = sum(jnp.where(condition, int(bit), 0).astype(jnp.int32) for condition, bit in bits)
     margin, source = evidence.tightest()
@@ -334,6 +343,11 @@ def _entire(box: Interval) -> Interval:
 
 def _inside(box: Interval, region: Interval) -> Any:
     return ((region.lower <= box.lower) & (box.upper <= region.upper)).all()
+
+
+def _in_u_region(observer: Observer, u: Any) -> Any:
+    """Do the design's enclosures of the derivatives hold for this known input?"""
+    return _inside(_point(u), observer.u_region)
 
 
 def _where(condition: Any, a: Interval, b: Interval) -> Interval:

@@ -302,8 +302,9 @@ def _check_rank(G: np.ndarray, H: np.ndarray) -> None:
     rank = 0 if (norms == 0).any() else np.linalg.matrix_rank(stacked / norms)
     if stacked.shape[0] < p or rank < p:
         raise ValueError(
-            f"System: [G; H] must have full column rank {p}; the input direction {np.round(right[-1], 6).tolist()} acts "
-            f"on neither state nor output (smallest singular value {singular[-1]:.3g}). Remove or merge unknown inputs."
+            f"System: [G; H] must have full column rank {p}; the input direction {np.round(right[-1], 6).tolist()} "
+            f"acts on neither state nor output (smallest singular value {singular[-1]:.3g}). Remove or merge "
+            "unknown inputs."
         )
 
 

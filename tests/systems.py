@@ -148,6 +148,7 @@ def s5(unknown_inputs: bool = True) -> Case:
 _AREA = np.array([28.0, 32.0, 28.0, 32.0])
 _OUTLET = np.array([0.071, 0.057, 0.071, 0.057])
 _S7_START = np.array([12.4, 12.7, 1.8, 1.4])
+_S7_SPREAD = np.array([1.0, 1.0, 0.5, 0.5])
 
 
 def _s7_f(gamma, gain, pumps_known):
@@ -174,7 +175,7 @@ def s7() -> Case:
             _s7_f((0.7, 0.6), (3.33, 3.35), True), lambda h: 0.5 * h[:2], G=G, H=H, m=2, state_bounds=positive
         ),
         noise=gx.Noise(w=ball([0.01] * 4), v=ball([0.02] * 2)),
-        initial=Interval(_S7_START - [1, 1, 0.5, 0.5], _S7_START + [1, 1, 0.5, 0.5]),
+        initial=Interval(_S7_START - _S7_SPREAD, _S7_START + _S7_SPREAD),
         region=Interval([8.0, 8.0, 0.6, 0.3], [20.0, 20.0, 4.0, 4.0]),
         steps=200,
         d=lambda key, steps: jnp.stack(

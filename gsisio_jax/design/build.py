@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
 
-from gsisio_jax.certificate import Certificate, spectral_radius
+from gsisio_jax.certificate import Certificate
 from gsisio_jax.contraction import Bank
+from gsisio_jax.design.bank import distinct, gains_for_missing, main_gain, profile_bank, typical_width, units
 from gsisio_jax.design.enclosures import Slopes, slopes_on
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import Feedthrough, factorise
 from gsisio_jax.design.first_sweep import check_first_sweep, contracting_gains, first_form
-from gsisio_jax.design.gains import improve, optimal_gain, profile_gain
+from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.inputs import input_bank
 from gsisio_jax.design.problem import GainProblem, without_rounding
 from gsisio_jax.design.recovery import recovers
@@ -23,8 +23,6 @@ from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval import Interval
 from gsisio_jax.observer import FirstSweep, Observer
 from gsisio_jax.system import Noise, System
-
-_MOST_OUTPUTS_FOR_ALL_PATTERNS = 4  # 2^4 patterns of missing entries get a gain each; beyond, one entry at a time
 
 
 def design_observer(
@@ -62,33 +60,32 @@ def design_observer(
 
     Source: design 4.1, 4.2 and 4.4.
     """
-    region, u_region = _check(system, noise, region, form, gains, u_region, sweeps)
+    given, u_region = _check(system, noise, region, form, gains, u_region, sweeps)
     feedthrough = factorise(np.asarray(system.H))
     everywhere = slopes_on(system, feedthrough.T2, system.state_bounds, u_region)
     check_existence(system, feedthrough, everywhere)
     plan = _Plan(system, noise, feedthrough, u_region)
-    if region is None:
-        region = find_region(system, lambda box: _steady_width(plan, box))
-    slopes = slopes_on(system, feedthrough.T2, region, u_region)
+    box = find_region(system, lambda box: _steady_width(plan, box)) if given is None else given
+    slopes = slopes_on(system, feedthrough.T2, box, u_region)
     if not slopes.finite:
         raise NoDesignFound(
-            f"design_observer: the derivatives of f or g are not bounded on the region {region}. Give a smaller region "
+            f"design_observer: the derivatives of f or g are not bounded on the region {box}. Give a smaller region "
             "that keeps away from points where they are infinite (a square root at 0, say)."
         )
     problem = plan.problem(slopes)
     check_rank(problem)
-    main = _main_gain(problem, region)
-    bank = [main, *_profile_bank(problem, main, region, gains - 1)]
+    main = main_gain(problem, box)
+    bank = [main, *profile_bank(problem, main, box, gains - 1)]
     if missing:
-        bank.extend(_gains_for_missing(problem, main, region, feedthrough))
-    bank = _distinct(bank)
+        bank.extend(gains_for_missing(problem, main, box, feedthrough))
+    bank = distinct(bank)
     first = first_form(system, feedthrough.T2, u_region)
     contracting = contracting_gains(problem, bank, everywhere)
     check_first_sweep(problem, bank[0], first, contracting[0] is not None)
     steady = problem.steady_width(bank[0])
-    width = _units(steady) if np.isfinite(steady).all() else _typical_width(problem, region)
+    width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
     # Where f and g are affine no enclosure depends on the region, so there is no region to leave.
-    promised_on = region if not everywhere.affine else Interval.entire(system.n)
+    promised_on = box if not everywhere.affine else Interval.entire(system.n)
     start = FirstSweep(
         form=None if system.g_takes_u else first,
         inverses=np.array([inverse for inverse in contracting if inverse is not None]).reshape(-1, system.n, system.n),
@@ -151,21 +148,19 @@ def _check(
             raise ValueError(
                 f"design_observer: the noise bounds of `{name}` must have shape ({size},), got {box.shape}"
             )
-    if isinstance(region, str) and region == "auto":
-        region = None
-    elif not isinstance(region, Interval) or region.shape != (system.n,):
+    if region != "auto" and (not isinstance(region, Interval) or region.shape != (system.n,)):
         raise ValueError(
             f'design_observer: `region` must be an Interval of shape ({system.n},) or "auto", got {region!r}'
         )
     if u_region is None:
         if system.f_takes_u or system.g_takes_u:
             raise ValueError(
-                "design_observer: f or g takes u; give `u_region`, the box of known inputs for which the design shall hold"
+                "design_observer: f or g takes u; give `u_region`, the box of known inputs for which the design holds"
             )
         u_region = Interval(np.zeros(system.m), np.zeros(system.m))
     if u_region.shape != (system.m,):
         raise ValueError(f"design_observer: `u_region` must have shape ({system.m},), got {u_region.shape}")
-    return region, u_region
+    return (region if isinstance(region, Interval) else None), u_region
 
 
 def _steady_width(plan: _Plan, region: Interval) -> np.ndarray:
@@ -174,106 +169,8 @@ def _steady_width(plan: _Plan, region: Interval) -> np.ndarray:
     if not slopes.finite:
         return np.full(plan.system.n, np.inf)
     problem = plan.problem(slopes)
-    gain = optimal_gain(problem, np.ones(problem.n), _typical_width(problem, region))
+    gain = optimal_gain(problem, np.ones(problem.n), typical_width(problem, region))
     return np.full(problem.n, np.inf) if gain is None else problem.steady_width(gain)
-
-
-def _main_gain(problem: GainProblem, region: Interval) -> np.ndarray:
-    """The certified gain if there is one; else the gain that keeps boxes of a typical width smallest."""
-    scale = _typical_width(problem, region)
-    gain = optimal_gain(problem, np.ones(problem.n), scale)
-    if gain is not None and np.isfinite(problem.steady_width(gain)).all():
-        # Solve once more in units of the answer: states of very different size are then equally accurate.
-        again = optimal_gain(problem, np.ones(problem.n), _units(problem.steady_width(gain)))
-        if again is not None and (problem.steady_width(again) <= problem.steady_width(gain)).all():
-            gain = again
-        return improve(problem, gain)
-    # No gain contracts. Widths of the cheapest gains over a few steps are the profile to be good at.
-    everything = np.full(problem.columns, True)
-    width, gain = scale, None
-    for _ in range(3):
-        gain = profile_gain(problem, width, everything, _units(width))
-        if gain is None:
-            break
-        width = problem.row_cost(gain, width)
-    if gain is None:
-        raise NoDesignFound(
-            "design_observer: the linear program for the gain has no solution although the rank condition holds; the "
-            "problem is badly scaled. Choose units in which states, outputs and noise have similar size."
-        )
-    if spectral_radius(problem.implicit(gain)) >= 1 - 1e-9:
-        raise NoDesignFound(
-            "design_observer: on this region the output is too nonlinear for the gain: rho(|N_z| R) = "
-            f"{spectral_radius(problem.implicit(gain)):.3g} >= 1, so the box of x[k] would not be finite. What may help: a "
-            "smaller region, or `state_bounds`."
-        )
-    return gain
-
-
-def _profile_bank(problem: GainProblem, main: np.ndarray, region: Interval, count: int) -> list[np.ndarray]:
-    """Gains that are best for boxes between the steady width and the region, log-spaced."""
-    if count <= 0:
-        return []
-    small = problem.steady_width(main)
-    small = _units(small) if np.isfinite(small).all() else _typical_width(problem, region)
-    large = np.asarray(region.width)
-    large = np.where(np.isfinite(large), np.maximum(large, 2 * small), 1e3 * small)
-    everything = np.full(problem.columns, True)
-    found = []
-    for share in np.linspace(0, 1, count + 1)[1:]:
-        width = small ** (1 - share) * large**share
-        found.append(profile_gain(problem, width, everything, _units(width)))
-    return [gain for gain in found if gain is not None]
-
-
-def _gains_for_missing(
-    problem: GainProblem, main: np.ndarray, region: Interval, feedthrough: Feedthrough
-) -> list[np.ndarray]:
-    """Gains for steps in which y[k-1] or entries of y[k] are missing (design 4.6)."""
-    l, q = problem.l, problem.q
-    width = np.asarray(region.width)
-    steady = problem.steady_width(main)
-    typical = np.where(np.isfinite(steady), 4 * _units(steady), _typical_width(problem, region))
-    width = np.where(np.isfinite(width), width, typical)
-    support = feedthrough.T2 != 0
-    if l <= _MOST_OUTPUTS_FOR_ALL_PATTERNS:
-        present = [set(kept) for size in range(l + 1) for kept in combinations(range(l), size)]
-    else:
-        present = [set(), *(set(range(l)) - {j} for j in range(l)), set(range(l))]
-    found = []
-    for before in (False, True):
-        for kept in present:
-            usable = np.full(problem.columns, True)
-            usable[:l] = before
-            usable[l : l + q] = [set(np.flatnonzero(row)) <= kept for row in support]
-            if not before or len(kept) < l:
-                found.append(profile_gain(problem, width, usable, _units(width)))
-    return [gain for gain in found if gain is not None]
-
-
-def _distinct(bank: list[np.ndarray]) -> list[np.ndarray]:
-    """Drop gains that repeat an earlier one; keep the first, certified one in front."""
-    kept: list[np.ndarray] = []
-    for gain in bank:
-        if not any(
-            np.allclose(gain, other, rtol=1e-7, atol=1e-12) and ((gain != 0) == (other != 0)).all() for other in kept
-        ):
-            kept.append(gain)
-    return kept
-
-
-def _typical_width(problem: GainProblem, region: Interval) -> np.ndarray:
-    """A first guess of the width of the boxes, (n,): from the region, else from what the outputs resolve."""
-    width = np.asarray(region.width)
-    with np.errstate(all="ignore"):
-        resolved = np.abs(np.linalg.pinv(problem.E)) @ problem.dv + problem.dw if problem.l else problem.dw
-    return np.where(np.isfinite(width) & (width > 0), width, _units(resolved))
-
-
-def _units(width: np.ndarray) -> np.ndarray:
-    """Widths as units: zeros become a share of the largest."""
-    largest = width.max(initial=0.0)
-    return np.maximum(width, 1e-3 * largest) if largest > 0 else np.ones_like(width)
 
 
 def _assemble(
@@ -338,6 +235,7 @@ def _assemble(
         bounded_states=problem.C[q:],
         bounded_inputs=np.eye(problem.G.shape[1])[~problem.free],
         region_inverse=region_inverse,
+        u_region=plan.u_region if system.f_takes_u or system.g_takes_u else Interval.entire(system.m),
         first=start,
         current=feedthrough.current,
         current_input_directions=feedthrough.V1,

@@ -42,10 +42,10 @@ def check_existence(system: System, feedthrough: Feedthrough, everywhere: Slopes
     if direction is None:
         return
     raise ObserverDoesNotExist(
-        f"design_observer: no observer exists. The unknown input direction d = {_show(direction)} never reaches an output: "
-        "H d = 0, and the outputs that are free of d do not change when the state moves along "
-        f"G d = {_show(G @ direction)}. Remedies: measure a state that it moves, or give `input_bounds` or `state_bounds` "
-        "along this direction."
+        f"design_observer: no observer exists. The unknown input direction d = {_show(direction)} never reaches an "
+        "output: H d = 0, and the outputs that are free of d do not change when the state moves along "
+        f"G d = {_show(G @ direction)}. Remedies: measure a state that it moves, or give `input_bounds` or "
+        "`state_bounds` along this direction."
     )
 
 
@@ -59,8 +59,8 @@ def check_rank(problem: GainProblem) -> None:
         return
     raise NoDesignFound(
         f"design_observer: with the slopes at the centre of the region, the unknown input direction "
-        f"d = {_show(direction)} (free inputs only) does not show in [H; C G], so no gain cancels it. It may be visible "
-        "elsewhere: choose a region around another point; or give `state_bounds` or `input_bounds`."
+        f"d = {_show(direction)} (free inputs only) does not show in [H; C G], so no gain cancels it. It may be "
+        "visible elsewhere: choose a region around another point; or give `state_bounds` or `input_bounds`."
     )
 
 

@@ -77,7 +77,7 @@ def _rational_left_null_space(rows: list[list[Fraction]]) -> list[list[Fraction]
     work = [list(row) + [Fraction(int(i == j)) for j in range(l)] for i, row in enumerate(rows)]
     pivot = 0
     for column in range(p):
-        # Prefer a sparse pivot row: it keeps the null space sparse, and with it the gains usable when entries are missing.
+        # Prefer a sparse pivot row: it keeps T2 sparse, and with it the gains usable when entries are missing.
         candidates = [i for i in range(pivot, l) if work[i][column] != 0]
         if not candidates:
             continue

@@ -11,6 +11,7 @@ from typing import Any
 
 import cvxpy as cp
 import numpy as np
+from cvxpy.error import SolverError
 
 from gsisio_jax.design.problem import GainProblem
 
@@ -138,7 +139,7 @@ def solve(goal: cp.Problem) -> bool:
         warnings.simplefilter("ignore")  # "may be inaccurate": the result is checked, not believed
         try:
             goal.solve(**_SOLVER)
-        except cp.error.SolverError:
+        except SolverError:
             return False
     return goal.status in ("optimal", "optimal_inaccurate")
 

@@ -7,6 +7,7 @@ linear program to be best at the steady width, row by row.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 
 import cvxpy as cp
@@ -110,7 +111,7 @@ def _pseudo_inverse(problem: GainProblem) -> np.ndarray:
     return without_rounding(np.linalg.pinv(np.vstack([problem.G, problem.H])))
 
 
-def _distinct(found: list[np.ndarray | None]) -> list[np.ndarray]:
+def _distinct(found: Sequence[np.ndarray | None]) -> list[np.ndarray]:
     kept: list[np.ndarray] = []
     for matrix in found:
         if matrix is not None and not any(np.allclose(matrix, other, rtol=1e-7, atol=1e-12) for other in kept):

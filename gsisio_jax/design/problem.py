@@ -57,7 +57,7 @@ class GainProblem:
         return self.F.shape[0]
 
     @property
-    def l(self) -> int:
+    def l(self) -> int:  # noqa: E743
         return self.E.shape[0]
 
     @property

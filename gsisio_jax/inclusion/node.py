@@ -126,9 +126,13 @@ def meet(node: Node) -> Node:
 
 
 def best_form(slope: Any, offset: Interval, natural: Interval, box: Interval) -> Form:
-    """The form with this slope, or slope 0 with the natural range where that one is narrower."""
+    """The form with this slope, or slope 0 with the natural range where that one is narrower.
+
+    A slope that overflowed needs no care here: its image is not a number, which never enters a range, and the
+    finished form is given slope 0.
+    """
     width = offset.upper - offset.lower
-    good = jnp.isfinite(width) & (width <= natural.upper - natural.lower) & jnp.isfinite(jnp.abs(slope).sum(0))
+    good = jnp.isfinite(width) & (width <= natural.upper - natural.lower)
     return Form(jnp.where(good, slope, 0), choose(good, offset, natural), box)
 
 

@@ -1,0 +1,150 @@
+"""The gain program: its optimum against references, against perturbation, and against an independent solver."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import systems
+from scipy import optimize
+
+from gsisio_jax import Interval
+from gsisio_jax.design.build import _Plan
+from gsisio_jax.design.enclosures import slopes_on
+from gsisio_jax.design.feedthrough import factorise
+from gsisio_jax.design.gains import improve, optimal_gain, profile_gain
+from gsisio_jax.design.problem import GainProblem
+
+
+def problem_of(case: systems.Case) -> GainProblem:
+    feedthrough = factorise(case.system.H)
+    u_region = case.u_region if case.u_region is not None else Interval(np.zeros(0), np.zeros(0))
+    return _Plan(case.system, case.noise, feedthrough, u_region).problem(
+        slopes_on(case.system, feedthrough.T2, case.region, u_region)
+    )
+
+
+CASES = {"s1": systems.s1(), "s4b": systems.s4(True), "s5": systems.s5(), "s7": systems.s7()}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def solved(request):
+    problem = problem_of(CASES[request.param])
+    width = np.asarray(CASES[request.param].region.width)
+    scale = np.where(np.isfinite(width), width, 1.0)
+    return problem, optimal_gain(problem, np.ones(problem.n), scale), scale
+
+
+def test_reference_widths_of_the_papers_example():
+    """Design 4.4: W = (1.65, 2.49) on [-1,1] x [-1.5,1.5], which fits; (1.51, 2.31) on [-1,1]^2, which does not."""
+    for region, expected in (((1.0, 1.5), (1.65, 2.49)), ((1.0, 1.0), (1.51, 2.31))):
+        problem = problem_of(systems.s1(region=region))
+        steady = problem.steady_width(optimal_gain(problem, np.ones(2), np.ones(2)))
+        assert (steady <= 1.01 * np.array(expected)).all()
+        np.testing.assert_allclose(steady, expected, rtol=0.01)
+
+
+def test_the_weight_does_not_matter(solved):
+    problem, gain, scale = solved
+    steady = problem.steady_width(gain)
+    rng = np.random.default_rng(0)
+    for weight in (np.linspace(1, 10, problem.n), 10.0 ** rng.uniform(-1, 1, problem.n), np.full(problem.n, 0.3)):
+        other = problem.steady_width(optimal_gain(problem, weight, scale))
+        np.testing.assert_allclose(other, steady, rtol=1e-4)
+
+
+def test_the_equality_holds_and_the_inverse_is_nonnegative(solved):
+    problem, gain, _ = solved
+    assert np.abs(problem.residual(gain)[:, problem.free]).max(initial=0.0) < 1e-12
+    matrix = np.eye(problem.n) - problem.implicit(gain) - problem.growth(gain)
+    assert np.linalg.inv(matrix).min() > -1e-9
+    np.testing.assert_allclose(matrix @ problem.steady_width(gain), problem.noise_width(gain), rtol=1e-9, atol=1e-12)
+
+
+def test_a_perturbed_gain_is_never_better(solved):
+    problem, gain, _ = solved
+    best = problem.steady_width(improve(problem, gain))
+    seen = problem.seen[:, problem.free]
+    # Directions along which the equality stays true: rows of the left null space of [H; C G].
+    _, singular, right = np.linalg.svd(seen.T)
+    free = right[(singular > 1e-10).sum() :]
+    rng = np.random.default_rng(1)
+    for size in 10.0 ** rng.uniform(-6, 1, 300):
+        moved = gain + size * rng.normal(size=(problem.n, len(free))) * (rng.random((problem.n, 1)) < 0.7) @ free
+        assert (problem.steady_width(moved) >= best * (1 - 1e-6)).all()
+
+
+def test_rows_against_an_independent_linear_program(solved):
+    """profile_gain row by row against scipy's HiGHS on the same cost, posed from scratch."""
+    problem, gain, scale = solved
+    width = problem.steady_width(gain)
+    everything = np.full(problem.columns, True)
+    ours = problem.row_cost(profile_gain(problem, width, everything, scale), width)
+    np.testing.assert_allclose(ours, [_row_by_highs(problem, i, width) for i in range(problem.n)], rtol=1e-6)
+
+
+def _row_by_highs(problem: GainProblem, i: int, width: np.ndarray) -> float:
+    """min over rows y with y [H; C G] = G_i of the row cost: every absolute value |a + M'y| becomes a variable t."""
+    l, q, n = problem.l, problem.q, problem.n
+    e = np.eye(n)[i]
+    select_y, select_z = np.eye(problem.columns)[:l], np.eye(problem.columns)[l:]
+    P = -(select_z.T @ problem.C)  # P_i = e + y P
+    terms: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = [  # constant, matrix (columns, k), weights (k,)
+        (e @ problem.F, P @ problem.F - select_y.T @ problem.E, width),
+        (e, P, problem.F_radius @ width + problem.dw),
+        (np.zeros(l), select_y.T, problem.E_radius @ width + problem.dv),
+        (np.zeros(q), select_z.T[:, :q], problem.R @ width),
+        (np.zeros(l), select_z.T[:, :q] @ problem.T2, problem.dv),
+        (np.zeros(len(problem.ds)), select_z.T[:, q:], problem.ds),
+    ]
+    size = [len(weights) for _, _, weights in terms]
+    total = problem.columns + sum(size)
+    cost, rows, right, start = np.zeros(total), [], [], problem.columns
+    for (constant, matrix, weights), k in zip(terms, size, strict=True):
+        cost[start : start + k] = weights
+        for sign in (1, -1):
+            block = np.zeros((k, total))
+            block[:, : problem.columns] = sign * matrix.T
+            block[:, start : start + k] = -np.eye(k)
+            rows.append(block)
+            right.append(-sign * constant)
+        start += k
+    equality = np.zeros((problem.G.shape[1], total))
+    equality[:, : problem.columns] = problem.seen.T
+    bounds = [(None, None)] * problem.columns + [(0, None)] * sum(size)
+    found = optimize.linprog(cost, np.vstack(rows), np.concatenate(right), equality, problem.G[i], bounds)
+    assert found.status == 0
+    return found.fun
+
+
+def test_units_do_not_matter():
+    """The same plant in other units of states and outputs has the same gain in those units."""
+    problem = problem_of(systems.s1())
+    x, y = np.array([1e5, 1e-3]), np.array([1e-4, 1e3])
+    z = np.array([7.0])
+    scaled = dataclasses.replace(
+        problem,
+        F=problem.F * x[:, None] / x,
+        F_radius=problem.F_radius * x[:, None] / x,
+        E=problem.E * y[:, None] / x,
+        E_radius=problem.E_radius * y[:, None] / x,
+        T2=problem.T2 * z[:, None] / y,
+        C=problem.C * z[:, None] / x,
+        R=problem.R * z[:, None] / x,
+        G=problem.G * x[:, None],
+        H=problem.H * y[:, None],
+        dw=problem.dw * x,
+        dv=problem.dv * y,
+    )
+    plain = problem.steady_width(optimal_gain(problem, np.ones(2), np.ones(2)))
+    other = scaled.steady_width(optimal_gain(scaled, np.ones(2), x))
+    np.testing.assert_allclose(other / x, plain, rtol=1e-6)
+
+
+def test_a_bank_holds_the_certified_gain_first_and_more_behind():
+    case = systems.s4(True)
+    one, many = (case.design(gains=k, missing=False) for k in (1, 6))
+    assert one.gains.residual.shape[0] == 1
+    assert 1 < many.gains.residual.shape[0] <= 6  # equal gains are kept once
+    np.testing.assert_allclose(one.gains.residual[0], many.gains.residual[0], atol=1e-12)
+    with pytest.raises(ValueError, match="gains"):
+        case.design(gains=0)
