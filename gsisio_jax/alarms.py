@@ -48,15 +48,15 @@ class Alarm:
         """
         if self.kind == "output":
             names = [_pick(output_names, j, "output") for j in self.outputs]
-            gap = f"{self.gap:.5g}{_unit(output_units, self.outputs[0]) if len(self.outputs) == 1 else ''}"
+            gap = f"{_plain(self.gap)}{_unit(output_units, self.outputs[0]) if len(self.outputs) == 1 else ''}"
             subject = names[0] if len(names) == 1 else "the combination of " + " and ".join(names)
             return f"{subject}: the measurement lies {gap} outside of what the box of the state allows"
         if self.kind == "input":
-            gap = f"{self.gap:.5g}{_unit(input_units, self.index)}"
+            gap = f"{_plain(self.gap)}{_unit(input_units, self.index)}"
             return (
                 f"{_pick(input_names, self.index, 'input')}: the bounds of the unknown input miss each other by {gap}"
             )
-        name, gap = _pick(state_names, self.index, "state"), f"{self.gap:.5g}{_unit(state_units, self.index)}"
+        name, gap = _pick(state_names, self.index, "state"), f"{_plain(self.gap)}{_unit(state_units, self.index)}"
         if self.kind == "initial":
             return f"{name}: the initial box lies {gap} outside of the state bounds"
         return f"{name}: no value agrees with both the past and the measurements now, they are {gap} apart"
@@ -84,3 +84,8 @@ def _pick(names: Sequence[str] | None, index: int, what: str) -> str:
 
 def _unit(units: Sequence[str] | None, index: int) -> str:
     return f" {units[index]}" if units is not None and units[index] else ""
+
+
+def _plain(value: float) -> str:
+    """Five digits, without an exponent where a person would not write one: 224387, 21955, 0.0123."""
+    return f"{value:.0f}" if 1e4 <= value < 1e9 else f"{value:.5g}"

@@ -40,16 +40,15 @@ def target() -> systems.Case:
         traces.append(1)
         return jnp.stack([x[0] + 0.1 * x[1], x[1]])
 
+    slow = gx.Interval([-np.inf, -3.0], [np.inf, 3.0])
     return systems.Case(
-        system=gx.System(
-            f, lambda x: x, G=[[0.005], [0.1]], H=np.zeros((2, 1)), state_bounds=gx.Interval([-np.inf, -3.0], [np.inf, 3.0])
-        ),
+        system=gx.System(f, lambda x: x, G=[[0.005], [0.1]], H=np.zeros((2, 1)), state_bounds=slow),
         noise=gx.Noise(systems.ball([1e-3] * 2), systems.ball([0.1, 0.2])),
         initial=systems.ball([5.0, 1.0]),
         region=gx.Interval.entire(2),
         steps=STEPS,
         d=lambda key, steps: jax.random.normal(key, (steps, 1)),
-    )  # fmt: skip
+    )
 
 
 traces: list[int] = []
@@ -84,6 +83,13 @@ def paper():
 def linear():
     """A linear system with state bounds and lost rows; row 14 contradicts the rows before."""
     return _run(target(), [4, (8, 1), (11, 0), 12], push=np.array([50.0, 0.0]))
+
+
+@pytest.fixture(scope="module")
+def small():
+    """The linear system once more, as small as it gets: for tests that compile many variants of the same thing."""
+    run = _run(target(), [2], missing=False, sweeps=1)
+    return replace(run, y=run.y[:5], u=run.u[:5])
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +168,7 @@ def test_hold_equals_a_numpy_loop(linear):
 
 def varying(run: Run) -> gx.Noise:
     """Noise bounds (T, .) that shrink and grow."""
-    share = 1 + 0.5 * np.sin(np.arange(STEPS))[:, None]
+    share = 1 + 0.5 * np.sin(np.arange(len(run.y)))[:, None]
     return jax.tree.map(lambda bound: share * bound, run.noise)
 
 
@@ -172,11 +178,11 @@ def test_noise_that_changes_with_time(linear):
     assert_equal(est, numpy_loop(linear, noise=lambda k: jax.tree.map(lambda bound: bound[k], noise)))
 
 
-def test_one_bound_may_change_while_the_other_is_constant(linear):
-    noise = varying(linear)
-    constant = jax.tree.map(lambda bound: np.tile(bound, (STEPS, 1)), linear.noise)
-    est = gx.estimate(linear.observer, linear.initial, linear.y, noise=gx.Noise(linear.noise.w, noise.v))
-    expected = gx.estimate(linear.observer, linear.initial, linear.y, noise=gx.Noise(constant.w, noise.v))
+def test_one_bound_may_change_while_the_other_is_constant(small):
+    noise = varying(small)
+    constant = jax.tree.map(lambda bound: np.tile(bound, (len(small.y), 1)), small.noise)
+    est = gx.estimate(small.observer, small.initial, small.y, noise=gx.Noise(small.noise.w, noise.v))
+    expected = gx.estimate(small.observer, small.initial, small.y, noise=gx.Noise(constant.w, noise.v))
     assert_equal(est, expected)
 
 
@@ -191,14 +197,14 @@ def batch(run: Run, count: int = 3) -> tuple[gx.Interval, np.ndarray, gx.Noise]:
 
 
 @pytest.mark.parametrize("axes", [axes for axes in product([0, None], repeat=3) if axes != (None,) * 3])
-def test_batches_equal_a_loop(linear, axes):
+def test_batches_equal_a_loop(small, axes):
     """vmap over initial, y and noise in every combination, under jit."""
-    many = batch(linear)
-    single = (linear.initial, linear.y, linear.noise)
+    many = batch(small)
+    single = (small.initial, small.y, small.noise)
     args = [b if axis == 0 else a for a, b, axis in zip(single, many, axes, strict=True)]
 
     def one(initial, y, noise):
-        return gx.estimate(linear.observer, initial, y, noise=noise)
+        return gx.estimate(small.observer, initial, y, noise=noise)
 
     got = jax.jit(jax.vmap(one, in_axes=axes))(*args)
     for i in range(3):
@@ -218,12 +224,12 @@ def test_a_batch_of_everything_equals_a_loop(paper):
         assert_equal(jax.tree.map(lambda x: x[i], got), gx.estimate(paper.observer, row, y[i], noise=bounds))  # noqa: B023
 
 
-def test_under_jit(linear):
-    inside = jax.jit(lambda initial, y: gx.estimate(linear.observer, initial, y))(linear.initial, linear.y)
-    assert_equal(inside, gx.estimate(linear.observer, linear.initial, linear.y))
+def test_under_jit(small):
+    inside = jax.jit(lambda initial, y: gx.estimate(small.observer, initial, y))(small.initial, small.y)
+    assert_equal(inside, gx.estimate(small.observer, small.initial, small.y))
 
 
-def test_new_numbers_compile_nothing(linear):
+def test_new_numbers_compile_nothing(small):
     """Another initial box, record and noise of the same shapes: no trace of f, no compilation."""
     compiled = []
 
@@ -232,11 +238,11 @@ def test_new_numbers_compile_nothing(linear):
             compiled.append(event)
 
     def again(share: float) -> None:
-        initial = gx.Interval(linear.initial.lower * share, linear.initial.upper * share)
-        noise = jax.tree.map(lambda bound: share * bound, linear.noise)
-        gx.estimate(linear.observer, initial, linear.y * share, noise=noise)
-        carry, _ = gx.start(linear.observer, initial, linear.y[0] * share, noise=noise)
-        gx.step(linear.observer, carry, linear.y[1] * share, noise=noise)
+        initial = gx.Interval(small.initial.lower * share, small.initial.upper * share)
+        noise = jax.tree.map(lambda bound: share * bound, small.noise)
+        gx.estimate(small.observer, initial, small.y * share, noise=noise)
+        carry, _ = gx.start(small.observer, initial, small.y[0] * share, noise=noise)
+        gx.step(small.observer, carry, small.y[1] * share, noise=noise)
 
     again(1.0)
     before = len(traces)
@@ -245,7 +251,7 @@ def test_new_numbers_compile_nothing(linear):
         again(1.5)
         assert compiled == []
         assert len(traces) == before
-        gx.estimate(linear.observer, linear.initial, linear.y[:7])  # the counters do count
+        gx.estimate(small.observer, small.initial, small.y[:3])  # the counters do count
         assert compiled
         assert len(traces) > before
     finally:

@@ -73,11 +73,13 @@ def test_equal_to_central_differences(paper):
     point = paper.points()
     slopes = paper.gradients(point)
     random = np.random.default_rng(3)
-    kinds = {"initial": 0, "y": 1, "noise": 2}
-    directions = []
-    for kind in kinds.values():
-        parts = [jax.tree.map(lambda x, on=i == kind: on * random.standard_normal(x.shape), p) for i, p in enumerate(point)]
-        directions.append(tuple(parts))
+    directions = [
+        tuple(
+            jax.tree.map(lambda x, on=(i == kind): on * random.standard_normal(x.shape), part)
+            for i, part in enumerate(point)
+        )
+        for kind in range(3)  # initial box, record, noise
+    ]
     along = jax.tree.map(lambda *d: np.stack(d, axis=1), *directions)  # (points, kinds, ...)
 
     def moved(by: float) -> Any:
@@ -85,7 +87,7 @@ def test_equal_to_central_differences(paper):
 
     behind, here, ahead = (np.asarray(paper.values(moved(by))) for by in (-STEP, 0.0, STEP))
     central, left, right = (ahead - behind) / (2 * STEP), (here - behind) / STEP, (ahead - here) / STEP
-    products = jax.tree.map(lambda g, d: np.asarray(g[:, None] * d).reshape(POINTS, len(kinds), -1).sum(-1), slopes, along)
+    products = jax.tree.map(lambda g, d: (np.asarray(g)[:, None] * d).reshape(POINTS, 3, -1).sum(-1), slopes, along)
     predicted = sum(jax.tree.leaves(products))
     assert np.isfinite(predicted).all()
     wrong = np.abs(predicted - central) > 1e-5 * np.maximum(np.abs(central), 1e-2)

@@ -1,0 +1,1 @@
+"""Measured speed and memory; see README.md in this folder."""

@@ -1,0 +1,117 @@
+"""`python -m benchmarks`: run every case in a fresh process, print a table, write the results as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).resolve().parent / "results"
+SIZES = {  # full, quick
+    "compiled": ({"batch": 100_000, "steps": 100}, {"batch": 5_000, "steps": 50}),
+    "numpy": ({"batch": 2_000, "steps": 100}, {"batch": 1_000, "steps": 20}),
+    "tanks": ({"steps": 100}, {"steps": 50}),
+}
+
+
+def cases(quick: bool) -> dict[str, tuple[str, str, dict[str, int]]]:
+    """Name of every case: its module, its function and its arguments."""
+    size = {name: both[quick] for name, both in SIZES.items()}
+    return {
+        "throughput final widths": ("throughput", "final_widths", size["compiled"]),
+        "throughput all boxes": ("throughput", "all_boxes", size["compiled"]),
+        "throughput NumPy": ("throughput", "numpy", size["numpy"]),
+        "startup import": ("startup", "importing", {}),
+        "startup six tanks": ("startup", "tanks", size["tanks"]),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small sizes")
+    parser.add_argument("--only", default="", help="cases whose name contains this text")
+    parser.add_argument("--name", help="name of the result file (default: quick or full)")
+    parser.add_argument("--case", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    chosen = {name: spec for name, spec in cases(options.quick).items() if options.only in name}
+    if options.case:
+        print(json.dumps(run_here(*chosen[options.case])))
+        return 0
+    if not chosen:
+        parser.error(f"no case contains {options.only!r}; there are: {', '.join(cases(options.quick))}")
+    results = {name: run_apart(name, options.quick) for name in chosen}
+    print(table(results))
+    name = options.name or ("quick" if options.quick else "full")
+    RESULTS.mkdir(exist_ok=True)
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps({"setting": setting(), "results": results}, indent=2) + "\n")
+    print(f"\nwritten to {path}")
+    return 0 if all(result["ok"] for result in results.values()) else 1
+
+
+def run_here(module: str, function: str, arguments: dict[str, int]) -> dict[str, Any]:
+    """Run one case in this process."""
+    import importlib
+
+    measure: Callable[..., dict[str, Any]] = getattr(importlib.import_module(f"benchmarks.{module}"), function)
+    return measure(**arguments)
+
+
+def run_apart(name: str, quick: bool) -> dict[str, Any]:
+    """Run one case in a process of its own."""
+    print(f"{name} ...", file=sys.stderr, flush=True)
+    command = [sys.executable, "-m", "benchmarks", "--case", name, *(["--quick"] if quick else [])]
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=RESULTS.parent.parent, env={**os.environ, "JAX_ENABLE_X64": "1"}
+    )
+    if done.returncode:
+        print(done.stderr, file=sys.stderr)
+        return {"ok": False, "error": (done.stderr.strip().splitlines() or ["no message"])[-1]}
+    return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def setting() -> dict[str, Any]:
+    """What the figures depend on."""
+    model = platform.processor()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    packages = ("jax", "numpy", "equinox", "gsisio_jax")
+    return {
+        "processor": model,
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        **{package: version(package) for package in packages},
+    }
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """The results as text; ratios are against NumPy."""
+    slow = results.get("throughput NumPy", {}).get("rate")
+    head = f"{'case':<26}{'boxes x steps':>16}{'run':>10}{'compile':>10}{'rate':>16}{'/ NumPy':>9}{'peak':>10}  check"
+    lines = [head, "-" * len(head)]
+    for name, r in results.items():
+        size = f"{r['batch']:,} x {r['steps']}" if "batch" in r else ""
+        run, build = (f"{r[key]:.3g} s" if key in r else "" for key in ("seconds", "compile_seconds"))
+        rate = f"{r['rate'] / 1e6:.3f} M/s" if "rate" in r else ""
+        ratio = f"{r['rate'] / slow:.1f}" if "rate" in r and slow else ""
+        peak = f"{r['peak_mebibytes']:,.0f} MiB" if "peak_mebibytes" in r else ""
+        notes = [r.get("error") or ("passed" if r["ok"] else "FAILED")]
+        notes += [f"agrees to {r['gap']:.0e}"] if "gap" in r else []
+        notes += [f"design {r['design_seconds']:.1f} s"] if "design_seconds" in r else []
+        lines.append(f"{name:<26}{size:>16}{run:>10}{build:>10}{rate:>16}{ratio:>9}{peak:>10}  {', '.join(notes)}")
+    return "\n".join([*lines, "", "rate in million boxes x steps per second; NumPy's is that of the smaller batch."])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

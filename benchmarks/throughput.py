@@ -1,0 +1,124 @@
+"""Boxes times steps per second on the paper's example: compiled, and the same step in NumPy."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+
+import gsisio_jax as gx
+from benchmarks.plants import case, from_tests, records
+from gsisio_jax.observer import advance, begin
+
+REPEATS = 3
+AGREEMENT = 1e-9
+
+
+def final_widths(batch: int, steps: int) -> dict[str, Any]:
+    """Only the widths of the last step leave the compiled program."""
+    return _compiled(batch, steps, lambda est: est.state.width[-1])
+
+
+def all_boxes(batch: int, steps: int) -> dict[str, Any]:
+    """Every box and status is stored."""
+    return _compiled(batch, steps, lambda est: (est.state, est.input, est.status))
+
+
+def numpy(batch: int, steps: int) -> dict[str, Any]:
+    """The same step, vmapped, operation by operation in NumPy; compared with the compiled one."""
+    plant = case("s1")
+    observer = plant.design(missing=False)
+    initial, y, x = records(plant, batch, steps)
+    u = np.zeros((batch, 0))
+    program = from_tests("oracles.numpy_program").numpy_function
+    first = program(jax.vmap(partial(_begin, observer)), initial, y[:, 0], u)
+    carry, _ = first(initial, y[:, 0], u)
+    following = program(jax.vmap(partial(_advance, observer)), carry, y[:, 1], u)
+
+    def loop() -> tuple[list[Any], float]:
+        started = time.perf_counter()
+        carry, out = first(initial, y[:, 0], u)
+        boxes = [out.state]
+        for k in range(1, steps):
+            carry, out = following(carry, y[:, k], u)
+            boxes.append(out.state)
+        return boxes, time.perf_counter() - started
+
+    boxes, seconds = loop()
+    loops = jax.tree.map(lambda *rows: np.stack(rows, axis=1), *boxes)
+    compiled = jax.jit(jax.vmap(lambda box, y: gx.estimate(observer, box, y).state))(initial, y)
+    gaps = [
+        np.abs(a - b).max() / np.abs(b).max()
+        for a, b in zip(jax.tree.leaves(loops), jax.tree.leaves(compiled), strict=True)
+    ]
+    return {
+        "batch": batch,
+        "steps": steps,
+        "seconds": seconds,
+        "rate": batch * steps / seconds,
+        "gap": float(max(gaps)),
+        "sound": bool(loops.contains(x).all()),
+        "ok": bool(max(gaps) < AGREEMENT and loops.contains(x).all()),
+    }
+
+
+def _begin(observer: Any, initial: Any, y: Any, u: Any) -> Any:
+    return begin(observer, initial, y, u, observer.noise)
+
+
+def _advance(observer: Any, carry: Any, y: Any, u: Any) -> Any:
+    return advance(observer, carry, y, u, observer.noise)
+
+
+def _compiled(batch: int, steps: int, keep: Callable[[Any], Any]) -> dict[str, Any]:
+    plant = case("s1")
+    observer = plant.design(missing=False)
+    initial, y, x = records(plant, batch, steps)
+    run = jax.jit(jax.vmap(lambda box, y: keep(gx.estimate(observer, box, y))))
+    before = _peak()
+    args = jax.device_put((initial, y))
+    started = time.perf_counter()
+    program = run.lower(*args).compile()
+    compile_seconds = time.perf_counter() - started
+    result = jax.block_until_ready(program(*args))
+    seconds = min(_timed(program, args) for _ in range(REPEATS))
+    peak = _peak() - before
+    return {
+        "batch": batch,
+        "steps": steps,
+        "compile_seconds": compile_seconds,
+        "seconds": seconds,
+        "rate": batch * steps / seconds,
+        "peak_mebibytes": peak / 2**20,
+        **_checked(run, observer, args, x, result),
+    }
+
+
+def _checked(run: Any, observer: Any, args: Any, x: np.ndarray, result: Any) -> dict[str, Any]:
+    """Boxes contain the truth. Where they were not kept, a small part of the batch is computed again, and its last
+    widths compared with the kept ones."""
+    if isinstance(result, tuple):
+        sound = bool(np.asarray(result[0].contains(x)).all())
+        return {"sound": sound, "ok": sound}
+    part = jax.tree.map(lambda a: a[:1000], args)
+    boxes = jax.jit(jax.vmap(lambda box, y: gx.estimate(observer, box, y).state))(*part)
+    sound = bool(np.asarray(boxes.contains(x[:1000])).all())
+    widths = np.asarray(boxes.width[:, -1])
+    gap = float(np.abs(widths - np.asarray(result)[:1000]).max() / widths.max())
+    return {"sound": sound, "gap": gap, "ok": sound and gap < AGREEMENT and bool(np.isfinite(result).all())}
+
+
+def _timed(program: Any, args: Any) -> float:
+    started = time.perf_counter()
+    jax.block_until_ready(program(*args))
+    return time.perf_counter() - started
+
+
+def _peak() -> float:
+    """Largest resident set of this process so far, in bytes (Linux counts kibibytes)."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
