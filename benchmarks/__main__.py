@@ -73,8 +73,14 @@ def run_apart(name: str, quick: bool) -> dict[str, Any]:
     )
     if done.returncode:
         print(done.stderr, file=sys.stderr)
-        return {"ok": False, "error": (done.stderr.strip().splitlines() or ["no message"])[-1]}
+        return {"ok": False, "error": _last_error(done.stderr)}
     return json.loads(done.stdout.strip().splitlines()[-1])
+
+
+def _last_error(text: str) -> str:
+    """The line of a traceback that names the error."""
+    lines = [line for line in text.splitlines() if "Error" in line and not line.startswith(" ")]
+    return lines[-1] if lines else "no message"
 
 
 def setting() -> dict[str, Any]:
@@ -98,18 +104,21 @@ def setting() -> dict[str, Any]:
 def table(results: dict[str, dict[str, Any]]) -> str:
     """The results as text; ratios are against NumPy."""
     slow = results.get("throughput NumPy", {}).get("rate")
-    head = f"{'case':<26}{'boxes x steps':>16}{'run':>10}{'compile':>10}{'rate':>16}{'/ NumPy':>9}{'peak':>10}  check"
+    titles = f"{'case':<26}{'boxes x steps':>16}{'run':>10}{'cpu':>10}{'compile':>10}{'rate':>14}"
+    head = f"{titles}{'/ NumPy':>9}{'peak':>11}  check"
     lines = [head, "-" * len(head)]
     for name, r in results.items():
         size = f"{r['batch']:,} x {r['steps']}" if "batch" in r else ""
-        run, build = (f"{r[key]:.3g} s" if key in r else "" for key in ("seconds", "compile_seconds"))
+        keys = ("seconds", "cpu_seconds", "compile_seconds")
+        run, cpu, build = (f"{r[key]:.3g} s" if key in r else "" for key in keys)
         rate = f"{r['rate'] / 1e6:.3f} M/s" if "rate" in r else ""
         ratio = f"{r['rate'] / slow:.1f}" if "rate" in r and slow else ""
         peak = f"{r['peak_mebibytes']:,.0f} MiB" if "peak_mebibytes" in r else ""
         notes = [r.get("error") or ("passed" if r["ok"] else "FAILED")]
         notes += [f"agrees to {r['gap']:.0e}"] if "gap" in r else []
         notes += [f"design {r['design_seconds']:.1f} s"] if "design_seconds" in r else []
-        lines.append(f"{name:<26}{size:>16}{run:>10}{build:>10}{rate:>16}{ratio:>9}{peak:>10}  {', '.join(notes)}")
+        left = f"{name:<26}{size:>16}{run:>10}{cpu:>10}{build:>10}{rate:>14}"
+        lines.append(f"{left}{ratio:>9}{peak:>11}  {', '.join(notes)}")
     return "\n".join([*lines, "", "rate in million boxes x steps per second; NumPy's is that of the smaller batch."])
 
 

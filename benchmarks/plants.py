@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,12 @@ def from_tests(name: str) -> Any:
     return __import__(name, fromlist=["*"])
 
 
-def case(name: str) -> Any:
-    """A test system by its name in tests/systems.py: s1, s5, ..."""
-    return getattr(from_tests("systems"), name)()
+def case(name: str, steps: int) -> Any:
+    """A test system by its name in tests/systems.py (s1, s5, ...), with runs of `steps` steps."""
+    return replace(getattr(from_tests("systems"), name)(), steps=steps)
 
 
-def records(plant: Any, batch: int, steps: int) -> tuple[Any, np.ndarray, np.ndarray]:
+def records(plant: Any, batch: int) -> tuple[Any, np.ndarray, np.ndarray]:
     """Initial boxes (batch, n), measurements (batch, T, l) and true states (batch, T, n) of `batch` runs.
 
     The initial boxes are those of the test system, moved and scaled a little around the true state.
@@ -35,7 +36,7 @@ def records(plant: Any, batch: int, steps: int) -> tuple[Any, np.ndarray, np.nda
     @jax.jit
     @jax.vmap
     def draw(key: Any) -> tuple[Any, Any]:
-        run, _ = plant.simulate(key, steps)
+        run, _ = plant.simulate(key)
         return run.y, run.x[:-1]
 
     y, x = map(np.asarray, draw(jax.random.split(jax.random.key(0), batch)))

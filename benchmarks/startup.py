@@ -27,8 +27,8 @@ def tanks(steps: int) -> dict[str, Any]:
     import gsisio_jax as gx
     from benchmarks.plants import case
 
-    plant = case("s5")
-    record, _ = plant.simulate(jax.random.key(0), steps)
+    plant = case("s5", steps)
+    record, _ = plant.simulate(jax.random.key(0))
     started = time.perf_counter()
     observer = plant.design()
     designed = time.perf_counter()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,6 +18,7 @@ from gsisio_jax.interval import Interval, add, image, intersect, scale
 from gsisio_jax.status import SOURCE_STRIDE, Source
 
 _SMALLEST_SLOPE = 1e-9  # share of a strip's largest slope below which dividing by it can only widen
+_ROUNDING = 2.0**12  # gaps below this many ulps of the largest number of a step are not called contradictions
 _INVERSE_RESIDUAL = 1e3  # in units of the machine epsilon: how well an inverse must verify to be used
 
 
@@ -27,16 +29,23 @@ class Evidence(eqx.Module):
         box: the box (n,), never crossed.
         slacks: one vector per intersection, in order.
         sources: for every slack which piece it stands for, ``Source * SOURCE_STRIDE + index``.
+        scale: the largest number that entered the step, for telling a contradiction from rounding.
     """
 
     box: Interval
+    scale: Any
     slacks: tuple[Any, ...] = ()
     sources: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
 
     def weigh(self, slack: Any, kind: Source) -> Evidence:
         """Record the slack (k,) of an intersection that leaves the box as it is."""
         codes = tuple(int(kind) * SOURCE_STRIDE + i for i in range(slack.shape[0]))
-        return Evidence(self.box, (*self.slacks, slack), (*self.sources, codes)) if codes else self
+        if not codes:
+            return self
+        # Boxes that only touch (noise on its bound, zero noise) may miss each other by rounding: that is no conflict.
+        rounding = _ROUNDING * jnp.finfo(slack.dtype).eps * self.scale
+        slack = jnp.where((slack < 0) & (slack >= -rounding), 0, slack)
+        return Evidence(self.box, self.scale, (*self.slacks, slack), (*self.sources, codes))
 
     def meet(self, others: Interval, kind: Source, by_row: bool = False) -> Evidence:
         """Intersect the box with a stack (k, n) of boxes of the same vector, all at once.
@@ -56,7 +65,7 @@ class Evidence(eqx.Module):
         empty = tightest < 0
         met = Interval.unchecked(jnp.where(empty, box.lower, lower), jnp.where(empty, box.upper, upper))
         noted = self.weigh(slack.min(1), kind).weigh(apart, Source.STATE) if by_row else self.weigh(tightest, kind)
-        return Evidence(met, noted.slacks, noted.sources)
+        return Evidence(met, self.scale, noted.slacks, noted.sources)
 
     @property
     def conflict(self) -> Any:
@@ -76,6 +85,12 @@ class Evidence(eqx.Module):
         # No argmin and no gather: both are slow in batches.
         source = jnp.where(candidate & (slack == margin), codes, np.int32(np.iinfo(np.int32).max)).min()
         return margin, jnp.where(jnp.isinf(margin), 0, source)
+
+
+def magnitude(*values: Any) -> Any:
+    """The largest finite absolute value of some arrays."""
+    finite = [jnp.where(jnp.isfinite(value), jnp.abs(value), 0) for value in values]
+    return jax.lax.stop_gradient(jnp.concatenate([value.ravel() for value in finite]).max(initial=0.0))
 
 
 class Bank(eqx.Module):

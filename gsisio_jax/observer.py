@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from gsisio_jax import inclusion
 from gsisio_jax.certificate import Certificate
-from gsisio_jax.contraction import Bank, Evidence, Terms, centred, solve_remainder, strips
+from gsisio_jax.contraction import Bank, Evidence, Terms, centred, magnitude, solve_remainder, strips
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.interval import Interval, add, image, intersect, scale
 from gsisio_jax.status import Source, Status
@@ -127,9 +127,10 @@ def begin(
     """Step 0: the initial box met with the state bounds and with y[0]. Arrays must have their final dtype."""
     bounds = observer.system.state_bounds
     z = image(observer.T2, _output_box(observer.system, y, u, noise.v))
-    evidence = prior = Evidence(bounds).meet(initial[None], Source.INITIAL)
+    scale = magnitude(y, initial.lower, initial.upper)
+    evidence = prior = Evidence(bounds, scale).meet(initial[None], Source.INITIAL)
     form = _first_form(observer, u)  # valid on every smaller box: the first sweep serves the fallback too
-    fallback = prior if hold else strips(Evidence(bounds), form, z)
+    fallback = prior if hold else strips(Evidence(bounds, scale), form, z)
     for sweep in range(observer.sweeps):
         form = form if sweep == 0 else _free_output(observer, evidence.box, u)
         evidence = strips(evidence, form, z)
@@ -178,7 +179,7 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
 
     # 3.-5. Contract from the state bounds; y[k] alone first, because a restart begins there.
     z = image(observer.T2, output)
-    evidence = alone = Evidence(bounds)
+    evidence = alone = Evidence(bounds, magnitude(y, carry.y, before.lower, before.upper))
     form, d = _first_form(observer, u), None
     for sweep in range(observer.sweeps):
         form = form if sweep == 0 or observer.first.affine_output else _free_output(observer, evidence.box, u)
@@ -200,17 +201,14 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
 
 def _meet_closed_form(observer: Observer, evidence: Evidence, right: Interval, u: Any) -> Evidence:
     """Bounds that need no box to begin with: the contraction |N_z| R < 1 on the state bounds."""
-    for i, k in enumerate(observer.first.gains):
-        box = centred(
-            right[k],
-            observer.gains.remainder[k],
-            observer.first.inverses[i],
-            _psi(observer, u),
-            observer.system.state_bounds,
-        )
-        box = _where(_in_u_region(observer, u), box, _entire(box))
-        evidence = evidence.meet(box[None], Source.STATE)
-    return evidence
+    chosen = observer.first.gains
+    if not chosen:
+        return evidence
+    right, N_z = jax.tree.map(lambda x: jnp.stack([x[k] for k in chosen]), (right, observer.gains.remainder))
+    boxes = jax.vmap(centred, in_axes=(0, 0, 0, None, None))(
+        right, N_z, observer.first.inverses, _psi(observer, u), observer.system.state_bounds
+    )
+    return evidence.meet(_where(_in_u_region(observer, u), boxes, _entire(boxes)), Source.STATE)
 
 
 def _certified(
@@ -260,7 +258,7 @@ def _inputs(observer: Observer, evidence: Evidence, fixed: Interval, form: Affin
     # state x[k] - remainder psi(x[k]) with psi = (S - C) x + [e], slopes combined before the box is applied.
     slope = inverses.state - (inverses.remainder[..., None] * (form.slope - observer.C)).sum(-2)
     now = add(image(slope, box), image(-inverses.remainder, form.offset), fixed)
-    d = Evidence(observer.system.input_bounds).meet(now, Source.INPUT)
+    d = Evidence(observer.system.input_bounds, evidence.scale).meet(now, Source.INPUT)
     return d.box, evidence.weigh(d.slacks[0], Source.INPUT) if d.slacks else evidence
 
 
@@ -298,7 +296,7 @@ def _finish(
             applies = applies & _inside(carry.state, certificate.region)
     bits = (
         (conflict, Status.CONFLICT),
-        (jnp.isnan(y).any(), Status.MISSING),
+        (~jnp.isfinite(y).all(), Status.MISSING),
         (~(jnp.isfinite(state.lower) & jnp.isfinite(state.upper)).all(), Status.UNBOUNDED),
         (~applies, Status.OUTSIDE_REGION),
     )
@@ -308,8 +306,8 @@ def _finish(
 
 
 def _output_box(system: System, y: Any, u: Any, v: Interval) -> Interval:
-    """Box of ``y - D u - v``: of ``g(x) + H d``; all of R where y is NaN."""
-    missing = jnp.isnan(y)
+    """Box of ``y - D u - v``: of ``g(x) + H d``; all of R where y is NaN (or infinite: batches cannot refuse it)."""
+    missing = ~jnp.isfinite(y)
     known = jnp.where(missing, 0, y) - system.D @ u
     return Interval.unchecked(
         jnp.where(missing, -jnp.inf, known - v.upper), jnp.where(missing, jnp.inf, known - v.lower)

@@ -33,14 +33,25 @@ class Case:
     def design(self, **options: Any) -> gx.Observer:
         return gx.design_observer(self.system, self.noise, self.region, u_region=self.u_region, **options)
 
-    def simulate(self, key: Any, steps: int | None = None) -> tuple[gx.Simulation, Any]:
-        """One run from a random point of the initial box (corners and faces included)."""
-        steps = steps or self.steps
-        key_x, key_s, key_d = jax.random.split(key, 3)
+    def simulate(self, key: Any) -> tuple[gx.Simulation, Any]:
+        """One run from a random point of the initial box (its faces and corners included). In half of the runs the
+        noise lies on the vertices of its box at every step, in the others anywhere in it."""
+        key_x, key_s, key_d, key_w, key_v, key_kind = jax.random.split(key, 6)
         share = jnp.clip(jax.random.uniform(key_x, (self.system.n,), minval=-0.2, maxval=1.2), 0, 1)
         x0 = self.initial.lower + share * self.initial.width
-        d = self.d(key_d, steps)
-        return gx.simulate(self.system, key_s, x0, d, self.noise, jnp.asarray(self.u(steps))), d
+        d = self.d(key_d, self.steps)
+        at_vertices = jax.random.bernoulli(key_kind)
+        noise = gx.Noise(
+            _maybe_vertices(at_vertices, key_w, self.noise.w, self.steps),
+            _maybe_vertices(at_vertices, key_v, self.noise.v, self.steps),
+        )
+        return gx.simulate(self.system, key_s, x0, d, noise, jnp.asarray(self.u(self.steps))), d
+
+
+def _maybe_vertices(chosen: Any, key: Any, box: Interval, steps: int) -> Interval:
+    up = jax.random.bernoulli(key, shape=(steps, *box.shape))
+    corner = jnp.where(up, box.upper, box.lower)
+    return Interval(jnp.where(chosen, corner, box.lower), jnp.where(chosen, corner, box.upper))
 
 
 def ball(radius: Any) -> Interval:

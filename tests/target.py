@@ -34,7 +34,7 @@ class Target:
     bounds: Interval
 
     def simulate(self, seed: int, count: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """States (count, STEPS, 2), measurements, accelerations (count, STEPS); noise on its bounds every third time."""
+        """States (count, STEPS, 2), measurements, accelerations (count, STEPS); every third noise on its bound."""
         count = BATCH if count is None else count
         rng = np.random.default_rng(seed)
 

@@ -81,6 +81,8 @@ def certificate_lines(certificate: Any, problem: Problem) -> list[str]:
     elif not certificate.self_consistent:
         short = [name for name, slack in zip(problem.state.names, certificate.slack, strict=True) if slack < 0]
         lines = [f"empty: the certified widths do not fit into the region for {', '.join(short)}"]
+    elif not certificate.region_matters:
+        lines = ["holds anywhere: while no measurement is missing, widths settle at or below the certified ones"]
     else:
         lines = ["holds: as long as the boxes stay in the region, widths settle at or below the certified ones"]
     if certificate.recoverable is False:

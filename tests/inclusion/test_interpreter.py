@@ -28,14 +28,17 @@ def robot(x):
     return jnp.stack([px + 0.3 * jnp.cos(th), py + 0.3 * jnp.sin(th), near, th - jnp.arctan((15 - py) / (5 - px))])
 
 
-def busy(x):
-    """A bit of everything that has kinks, ties, poles or flat ends."""
-    return jnp.stack([
-        jnp.sin(x[0]) * x[1] + jnp.sqrt(x[1]), jnp.tanh(x[0]) + jnp.exp(x[1]), x[0] / jnp.abs(x[1]),
-        jnp.max(x) + jax.nn.relu(x[0]), jnp.arctan2(x[0], x[1]), jnp.log(x[0]) * x[1] + x[0] ** 3,
-        jnp.where(x[0] > 0, x[0], x[1]), jnp.linalg.norm(x), jnp.clip(x[0], -1, 1) + jnp.floor(x[1]),
-        jnp.arcsin(x[0]) + x[1] ** 0.3 + jnp.mod(x[0], 2.0), jnp.logaddexp(x[0], x[1]) + jnp.tan(x[0]) + jnp.cbrt(x[0]),
-    ])  # fmt: skip
+# Kinks, ties, poles, flat ends, ends of domains; all act on entries or on pairs of them, so they share compiled code.
+DELICATE = {
+    "waves": lambda x: jnp.sin(x) * x[::-1] + jnp.cos(3 * x),
+    "roots": lambda x: jnp.sqrt(x) + x**0.3 - jnp.cbrt(x),
+    "growth": lambda x: jnp.exp(x) + x**3 - jnp.tanh(x),
+    "logarithms": lambda x: x * jnp.log(x) + jnp.logaddexp(x, x[::-1]),
+    "quotients": lambda x: x / jnp.abs(x[::-1]) + jnp.tan(x),
+    "kinks": lambda x: jnp.max(x) + jax.nn.relu(x) - jnp.clip(x, -1, 1),
+    "jumps": lambda x: jnp.where(x > 0, x, x[::-1]) + jnp.floor(x) + jnp.mod(x, 2.0),
+    "plane": lambda x: jnp.arctan2(x, x[::-1]) + jnp.linalg.norm(x) - jnp.arcsin(x),
+}
 
 
 @pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.__name__)
@@ -99,45 +102,48 @@ SIDES = {
 }
 
 
-@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.__name__)
-def test_gradients_are_finite(bound):
+def flat_bounds(f, lower, upper, *args):
+    """Every number that comes out for f, in one row."""
+    box = Interval.unchecked(lower, upper)
+    return jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves([bound(f)(box, *args) for bound in BOUNDS[1:]])])
+
+
+@pytest.mark.parametrize("name", DELICATE)
+def test_gradients_are_finite(name):
     lower, upper = (np.array([side[i] for side in SIDES.values()]) for i in (0, 1))
 
     def pull(lower, upper):
-        out, back = jax.vjp(lambda a, b: jax.tree.leaves(bound(busy)(Interval.unchecked(a, b))), lower, upper)
+        out, back = jax.vjp(lambda a, b: flat_bounds(DELICATE[name], a, b), lower, upper)
         # Into every output at once, whatever its value, with weights that let nothing cancel.
-        return back([jnp.reshape(1.0 + jnp.arange(leaf.size) % 7, leaf.shape) for leaf in out])
+        return back(1.0 + jnp.arange(out.size) % 7)
 
     for gradient in jax.vmap(pull)(lower, upper):
-        bad = [name for name, row in zip(SIDES, gradient, strict=True) if not np.isfinite(row).all()]
+        bad = [kind for kind, row in zip(SIDES, gradient, strict=True) if not np.isfinite(row).all()]
         assert not bad
 
 
-@pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.__name__)
-def test_gradients_match_finite_differences(bound):
-    f = lambda x, a: jnp.stack([  # noqa: E731
-        jnp.sin(a * x[0]) * x[1], jnp.sqrt(x[1]) + jnp.tanh(x[0]), jnp.exp(x[0]) / x[1], jnp.arctan2(x[0], x[1]),
-        jnp.log(x[1]) - x[0] ** 3, jnp.maximum(x[0], 0.1 * x[1]), jnp.abs(x[0]) + x[1] * x[1],
-        jnp.cos(3 * x[0] + a) + 1 / x[1], jnp.linalg.norm(x), jnp.arctan(x[0] - a),
-    ])  # fmt: skip
-
+@pytest.mark.parametrize("f", [
+    lambda x, a: jnp.sin(a * x) * x[::-1] + jnp.cos(3 * x + a),
+    lambda x, a: jnp.sqrt(x + 1) + jnp.tanh(x) + jnp.exp(a * x) / (x + 2),
+    lambda x, a: jnp.log(x + 2) - x**3 + jnp.arctan(x - a),
+    lambda x, a: jnp.maximum(x, 0.1 * x[::-1]) + jnp.abs(x) + a * x * x,
+    lambda x, a: jnp.arctan2(x + 1, x[::-1] + a) + jnp.linalg.norm(x + 1),
+])  # fmt: skip
+def test_gradients_match_finite_differences(f):
     def flat(p):
-        out = bound(f)(Interval.unchecked(p[:2], p[2:4]), p[4])
-        return jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(out)])
+        return flat_bounds(f, p[:2], p[2:4], p[4])
 
-    p, step = jnp.array([-0.43, 0.71, 0.29, 1.37, 0.83]), 1e-6 * np.eye(5)
-    exact = np.asarray(jax.jacfwd(flat)(p))
-    _, back = jax.vjp(flat, p)
-    weights = 1.0 + np.arange(len(exact)) % 7
-    np.testing.assert_allclose(back(jnp.asarray(weights))[0], weights @ exact, rtol=1e-10)
+    p, step = jnp.array([-0.43, -0.19, 0.29, 1.37, 0.83]), 1e-6 * np.eye(5)
+    out, back = jax.vjp(flat, p)
+    gradient = np.asarray(jax.vmap(lambda row: back(row)[0])(np.eye(out.size)))
     values = np.asarray(jax.vmap(flat)(np.concatenate([p + step, p - step])))
-    np.testing.assert_allclose(exact, (values[:5] - values[5:]).T / 2e-6, atol=1e-7, rtol=1e-6)
+    np.testing.assert_allclose(gradient, (values[:5] - values[5:]).T / 2e-6, atol=1e-7, rtol=1e-6)
 
 
 def test_float32_in_float32_out():
     box = Interval(np.array([-1, 0.5], np.float32), np.array([1, 2], np.float32))
-    for bound in BOUNDS:
-        for leaf in jax.tree.leaves(bound(busy)(box)):
+    for f in DELICATE.values():
+        for leaf in jax.tree.leaves((inclusion.affine(f)(box), inclusion.jacobian(f)(box))):
             assert leaf.dtype == jnp.float32
             assert not np.isnan(leaf).any()
     x = np.random.default_rng(0).uniform(box.lower, box.upper, (200, 2))
@@ -219,12 +225,12 @@ def test_long_scan_equals_the_unrolled_one():
         level = 0.9 * level + 0.1 * jnp.sin(level) * a
         return (level, count + 1), level[0] + count
 
-    f = lambda x: lax.scan(turn, (x, 0.0), x[0] * jnp.arange(30.0) / 30)  # noqa: E731
-    g = lambda x: lax.scan(turn, (x, 0.0), x[0] * jnp.arange(30.0) / 30, unroll=30)  # noqa: E731
+    f = lambda x: lax.scan(turn, (x, 0.0), x[0] * jnp.arange(18.0) / 18)  # noqa: E731
+    g = lambda x: lax.scan(turn, (x, 0.0), x[0] * jnp.arange(18.0) / 18, unroll=18)  # noqa: E731
 
     def by_hand(x):
         c, out = (x, 0.0), []
-        for a in x[0] * jnp.arange(30.0) / 30:
+        for a in x[0] * jnp.arange(18.0) / 18:
             c, y = turn(c, a)
             out.append(y)
         return c, jnp.stack(out)
@@ -232,7 +238,7 @@ def test_long_scan_equals_the_unrolled_one():
     box = Interval([0.2, -0.4], [0.5, 0.1])
     for bound in (inclusion.natural, inclusion.affine, inclusion.jacobian):
         for other in (g, by_hand):
-            for a, b in zip(jax.tree.leaves(bound(f)(box)), jax.tree.leaves(jax.jit(bound(other))(box)), strict=True):
+            for a, b in zip(jax.tree.leaves(bound(f)(box)), jax.tree.leaves(bound(other)(box)), strict=True):
                 np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-13)
 
 

@@ -107,7 +107,7 @@ def test_extremes_of_entries():
     assert bounds.upper.tolist() == [3, 0.5, 3]
     # The last entry can never be the largest, so the maximum does not depend on it.
     assert jac.lower.tolist() == [[0, 0, 0], [0, 0, 0], [0, 0, 0]]
-    assert jac.upper[[0, 2]].tolist() == [[1, 1, 0], [1, 1, 0]]
+    assert jac.upper[np.array([0, 2])].tolist() == [[1, 1, 0], [1, 1, 0]]
     assert (jac.upper[1] <= 1).all()
 
 
@@ -144,7 +144,7 @@ def test_logic_in_three_values():
         ])  # fmt: skip
 
     bounds = inclusion.natural(lambda x: f(x) * 1.0)(box((-1, 0.5), (1, 2)))
-    assert bounds.lower.tolist() == [0, 1, 0, 0, 1, 0, 1, 0, 0, 1, 0]
+    assert bounds.lower.tolist() == [0, 1, 0, 0, 1, 0, 1, 0, 1, 1, 0]
     assert bounds.upper.tolist() == [1, 1, 0, 1, 1, 1, 1, 0, 1, 1, 1]
     # Affine forms know that x and x + 1 move together.
     assert inclusion.affine(lambda x: (x[0] < x[0] + 1) * 1.0)(box((-5, 5))).range.lower == 1

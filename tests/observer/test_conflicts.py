@@ -10,6 +10,7 @@ import target as tg
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
+from gsisio_jax.estimation import collect, resume
 
 ROUNDING = 1e-9
 K, JUMP = 30, 40.0
@@ -146,7 +147,6 @@ def test_conflict_at_the_first_row(target, truth):
             np.testing.assert_allclose(est.state.upper[0], box[1], rtol=1e-12)
         est = tg.record(target.run(y[None], "restart", initial), 0)
         assert est.state.contains(truth[0], -ROUNDING).all()
-    assert cases[0][1] in "initial box lies outside"
     expected = f"speed: the initial box lies {tg.SPEED:.5g} outside of the state bounds"
     assert tg.record(target.run(y[None], initial=beyond), 0).alarms()[0].describe(["east", "speed"]) == expected
 
@@ -182,8 +182,9 @@ def small():
 def test_online_runs_equal_the_estimate(small, on_conflict):
     """start, step and resume, with the carry written to a file in between."""
     observer, initial, y = small
-    est = gx.estimate(observer, initial, y, on_conflict=on_conflict)
-    assert conflicts(est) == [12]
+    est = jax.tree.map(np.asarray, gx.estimate(observer, initial, y, on_conflict=on_conflict))
+    # The restart believes the lie, which the next measurement contradicts.
+    assert conflicts(est) == ([12, 13] if on_conflict == "restart" else [12])
     carry, out = gx.start(observer, initial, y[0], on_conflict=on_conflict)
     outputs = [out]
     for k in range(1, 14):
@@ -197,8 +198,8 @@ def test_online_runs_equal_the_estimate(small, on_conflict):
             np.savez(file, *leaves)
             file.seek(0)
             carry = jax.tree.unflatten(tree, np.load(file).values())
-    carry, out = gx.resume(observer, carry, y[14:], on_conflict=on_conflict)
-    joined = gx.collect(observer, [*outputs, out])
+    carry, out = resume(observer, carry, y[14:], on_conflict=on_conflict)
+    joined = collect(observer, [*outputs, out])
     np.testing.assert_array_equal(carry.y, y[-1])
     for got, expected in zip(jax.tree.leaves(joined), jax.tree.leaves(est), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
@@ -208,7 +209,7 @@ def test_online_runs_equal_the_estimate(small, on_conflict):
 def test_the_gap_by_hand_without_a_velocity(small):
     """x[k] = .5 x[k-1] + (y2[k-1] - x[k-1] - v2) + w must meet y1[k] +- .3."""
     observer, initial, y = small
-    est = gx.estimate(observer, initial, y)
+    est = jax.tree.map(np.asarray, gx.estimate(observer, initial, y))
     highest = -0.5 * est.state.lower[11, 0] + y[11, 1] + 0.2 + 0.2
     assert est.margin[12] == pytest.approx(highest - (y[12, 0] - 0.3), rel=1e-9)
     assert est.alarms()[0].kind == "state"

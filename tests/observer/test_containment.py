@@ -8,10 +8,10 @@ import systems
 
 import gsisio_jax as gx
 
-# (case, runs): at least 20,000 steps each.
+# (case, runs): at least 20,000 steps each, 200,000 for the paper's example.
 CASES = {
-    "S1": (systems.s1(), 340),
-    "S1, d ~ 1e3 N(0,1)": (systems.s1(d_scale=1e3), 340),
+    "S1": (systems.s1(), 3400),
+    "S1, d ~ 1e3 N(0,1)": (systems.s1(d_scale=1e3), 3400),
     "S4b": (systems.s4(True), 200),
     "S4a, no certificate": (systems.s4(False), 200),
     "S5": (systems.s5(), 100),
@@ -33,9 +33,11 @@ def test_zero_violations(name):
     def run(key):
         record, d = case.simulate(key)
         est = gx.estimate(observer, case.initial, record.y, u)
-        inside = est.state.contains(record.x[:-1]), est.input.contains(d[:-1])
-        now = observer.current_input_directions.T @ d.T
-        return est, *inside, est.current_input.contains(now.T), jnp.isfinite(record.x).all()
+        now = d @ observer.current_input_directions
+        truth = (est.state, record.x[:-1]), (est.input, d[:-1]), (est.current_input, now)
+        # Noise on a vertex is reached up to rounding of the simulated sum only; so are the boxes.
+        inside = [box.contains(value, -1e-12 * (1 + jnp.abs(value).max(initial=0.0))) for box, value in truth]
+        return est, *inside, jnp.isfinite(record.x).all()
 
     est, state, unknown, now, simulated = run(jax.random.split(jax.random.key(7), runs))
     assert simulated.all()
@@ -44,7 +46,7 @@ def test_zero_violations(name):
     assert unknown.all()
     assert now.all()
     assert not (np.asarray(est.status) & (gx.Status.CONFLICT | gx.Status.UNBOUNDED)).any()
-    assert np.asarray(est.margin).min() > 0
+    assert np.asarray(est.margin).min() >= 0
     assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves(est))
 
 

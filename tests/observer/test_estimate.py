@@ -64,7 +64,8 @@ def paper_with_bounds() -> systems.Case:
 
 def _run(case: systems.Case, holes: list[Any], push: Any = 0.0, **design: Any) -> Run:
     """A record with `holes` missing, and `push` added to row 14: a contradiction."""
-    record, _ = case.simulate(jax.random.key(1), STEPS)
+    case = replace(case, steps=STEPS)
+    record, _ = case.simulate(jax.random.key(1))
     y = np.array(record.y)
     for where in holes:
         y[where] = NAN
@@ -117,7 +118,7 @@ def assert_equal(got: Any, expected: Any, rtol: float = 1e-12):
 
 def numpy_loop(run: Run, hold: bool = False, noise: Any = None) -> gx.Estimate:
     """The same step in a Python loop over rows, every operation by NumPy."""
-    observer, noise = run.observer, noise or (lambda k: run.noise)
+    observer, noise = run.observer.astype(np.float64), noise or (lambda k: run.noise)
     first = numpy_function(partial(begin, observer, hold=hold), run.initial, run.y[0], run.u[0], noise(0))
     carry, out = first(run.initial, run.y[0], run.u[0], noise(0))
     following = numpy_function(partial(advance, observer, hold=hold), carry, run.y[1], run.u[1], noise(1))

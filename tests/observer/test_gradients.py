@@ -1,5 +1,6 @@
 """Gradients through `estimate`: finite everywhere, and equal to central differences where the result is smooth."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -29,7 +30,7 @@ class Case:
     """A test system with a compiled batch of gradients and one of values, both over `POINTS` points."""
 
     def __init__(self, case: systems.Case):
-        self.case = case
+        self.case = case = replace(case, steps=STEPS)
         observer, u = case.design(missing=False), jnp.asarray(case.u(STEPS))
         self.gradients = jax.jit(jax.vmap(jax.grad(partial(score, observer, u))))
         self.values = jax.jit(jax.vmap(jax.vmap(partial(score, observer, u))))
@@ -45,7 +46,7 @@ class Case:
             def moved(key: Any, bound: Any) -> Any:
                 return bound * jax.random.uniform(key, bound.shape, minval=0.6, maxval=1.4)
 
-            record, _ = self.case.simulate(keys[0], STEPS)
+            record, _ = self.case.simulate(keys[0])
             initial, noise = self.case.initial, self.case.noise
             spread = moved(keys[1], initial.radius), moved(keys[2], initial.radius)
             box = gx.Interval(initial.center - spread[0], initial.center + spread[1])
