@@ -90,12 +90,14 @@ class Carry(eqx.Module):
 
     Attributes:
         state: box of x[k], (n,).
+        h: affine bounds of [f; g] on that box, (n + l,).
         y: (l,) measurement k, NaN where missing or not believed.
         u: (m,) known input k.
         noise: bounds of w[k] and v[k].
     """
 
     state: Interval
+    h: AffineForm
     y: Any
     u: Any
     noise: Noise
@@ -166,10 +168,9 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
         shift, output, image(observer.bounded_states, bounds), image(observer.bounded_inputs, system.input_bounds)
     )
 
-    # 1. Bounds of h = [f; g] on the old box, once for all gains. 2. The right side of (*) without psi, jointly.
-    h = inclusion.affine(lambda x, u: jnp.concatenate([system.dynamics(x, u), system.measurement(x, u)]))(
-        before, carry.u
-    )
+    # 1. Bounds of h = [f; g] on the old box, once for all gains (the last step has left them). 2. The right side of (*)
+    # without psi, jointly.
+    h = carry.h
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), gains.flat(), inverses.flat())
     bound = both.explicit(h, before, terms)[0]
     right = Interval.unchecked(*(x[: gains.rows].reshape(-1, n) for x in (bound.lower, bound.upper)))
@@ -180,17 +181,19 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
     # 3.-5. Contract from the state bounds; y[k] alone first, because a restart begins there.
     z = image(observer.T2, output)
     evidence = alone = Evidence(bounds, magnitude(y, carry.y, before.lower, before.upper))
-    form, d = _first_form(observer, u), None
+    form, affine = _first_form(observer, u), observer.first.affine_output
     for sweep in range(observer.sweeps):
-        form = form if sweep == 0 or observer.first.affine_output else _free_output(observer, evidence.box, u)
+        form = form if sweep == 0 or affine else _free_output(observer, evidence.box, u)
         evidence = strips(evidence, form, z)
         if sweep == 0:
             alone = evidence
             evidence = _meet_closed_form(observer, evidence, right, u)
-        evidence = evidence.meet(solve_remainder(gains, right, form, observer.C), Source.STATE)
-        if system.p:
-            d, _ = _inputs(observer, evidence, d_fixed, form)
-            evidence = evidence.meet(add(f_now, image(system.G, d))[None], Source.DYNAMICS)
+        solved = right if affine else solve_remainder(gains, right, form, observer.C)
+        evidence = evidence.meet(solved, Source.STATE)
+    if system.p:
+        # The paper's own loop x = f + B u + G d + w: no way to a first box, but a contraction of a correct one.
+        d, _ = _inputs(observer, evidence, d_fixed, form)
+        evidence = evidence.meet(add(f_now, image(system.G, d))[None], Source.DYNAMICS)
 
     # 6. The certified bound, where both boxes lie in the region. (The form of the last sweep holds on smaller boxes.)
     evidence, inside = _certified(observer, evidence, before, right, terms, carry.u, u)
@@ -283,9 +286,8 @@ def _finish(
     y_kept = jnp.where(believed, y, jnp.nan)
 
     d = system.input_bounds if d is None else _where(conflict, system.input_bounds, d)
-    direct = inclusion.affine(lambda x, u: -(observer.current @ system.measurement(x, u)))(state, u)
-    seen = image(observer.current, _output_box(system, y_kept, u, noise.v))
-    current_input = add(seen, direct.range)
+    h = inclusion.affine(lambda x, u: jnp.concatenate([system.dynamics(x, u), system.measurement(x, u)]))(state, u)
+    current_input = _current_input(observer, h, state, _output_box(system, y_kept, u, noise.v))
 
     applies = _in_u_region(observer, u)
     if carry is not None:
@@ -302,7 +304,15 @@ def _finish(
     )
     status = sum(jnp.where(condition, int(bit), 0).astype(jnp.int32) for condition, bit in bits)
     margin, source = evidence.tightest()
-    return Carry(state, y_kept, u, noise), StepOutput(state, d, current_input, status, margin, source)
+    return Carry(state, h, y_kept, u, noise), StepOutput(state, d, current_input, status, margin, source)
+
+
+def _current_input(observer: Observer, h: AffineForm, state: Interval, output: Interval) -> Interval:
+    """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
+    n, weights = observer.system.n, -observer.current
+    slope = (weights[..., None] * h.slope[n:]).sum(-2)
+    joint = add(image(slope, state), image(weights, h.offset[n:]))
+    return add(intersect(joint, image(weights, h.range[n:]))[0], image(observer.current, output))
 
 
 def _output_box(system: System, y: Any, u: Any, v: Interval) -> Interval:

@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from gsisio_jax.inclusion.interpreter import evaluate
@@ -17,6 +18,7 @@ from gsisio_jax.inclusion.node import (
     as_node,
     choose,
     guard,
+    is_known,
     is_node,
     jac_of,
     product,
@@ -40,7 +42,7 @@ class AffineForm(eqx.Module):
     Source: design 5.
     """
 
-    slope: Float[Array, "*out n"]  # noqa: F722
+    slope: Float[Array, "*out n"]
     offset: Interval
     range: Interval
 
@@ -154,8 +156,8 @@ def _dtype(box: Interval, args: tuple[Any, ...]) -> Any:
 
 
 def _variable(box: Interval, derivative: bool = False) -> Node:
-    eye = jnp.eye(box.lower.shape[0], dtype=box.lower.dtype)
-    zero = jnp.zeros_like(box.lower)
+    eye = np.eye(box.lower.shape[0], dtype=box.lower.dtype)
+    zero = np.zeros(box.shape, box.lower.dtype)
     jac = Interval.unchecked(eye, eye) if derivative else None
     return Node(box, Form(eye, Interval.unchecked(zero, zero), box), jac)
 
@@ -194,8 +196,10 @@ def _finish_range(node: Node) -> Interval:
 def _finish_affine(node: Node, box: Interval) -> AffineForm:
     slope, offset = slope_of(node, box), guard(node.offset)
     # Slopes that overflowed say nothing: slope 0 does.
-    good = jnp.isfinite(jnp.abs(slope).sum(0))
     bounds = guard(node.range)
+    if is_known(slope):
+        return AffineForm(jnp.asarray(np.moveaxis(slope, 0, -1)), jax.tree.map(jnp.asarray, offset), bounds)
+    good = jnp.isfinite(jnp.abs(slope).sum(0))
     return AffineForm(jnp.moveaxis(jnp.where(good, slope, 0), 0, -1), choose(good, offset, bounds), bounds)
 
 

@@ -21,6 +21,7 @@ from gsisio_jax.inclusion.node import (
     is_node,
     join,
     meet,
+    moderate,
     parts,
     product,
     shift,
@@ -44,7 +45,10 @@ def multiply(x: Any, y: Any) -> Node:
     if box is not None:
         # x y = cy x + cx y - cx cy + (x - cx)(y - cy), and the last term is the only one that is not linear.
         cx, cy = x.range.center, y.range.center
-        spread = times(x.range.radius, y.range.radius)
+        largest = moderate(cx.dtype)
+        tame = (jnp.abs(cx) < largest) & (jnp.abs(cy) < largest)
+        cx, cy = jnp.where(tame, cx, 0), jnp.where(tame, cy, 0)
+        spread = jnp.where(tame, times(x.range.radius, y.range.radius), jnp.inf)
         linear = shift(stretch(cy, x.offset), stretch(cx, y.offset))
         offset = shift(linear, Interval.unchecked(-cx * cy - spread, -cx * cy + spread))
         form = best_form(cy * slope_of(x, box) + cx * slope_of(y, box), offset, natural, box)

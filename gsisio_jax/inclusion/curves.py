@@ -24,6 +24,11 @@ def _root(t: Any) -> Any:
     return jnp.where(t > 0, jnp.sqrt(jnp.where(t > 0, t, 1)), 0)
 
 
+def _cube_root(t: Any) -> Any:
+    """Cube root, with derivative 0 at 0 where it is infinite."""
+    return jnp.where(t == 0, 0, jnp.cbrt(jnp.where(t == 0, 1, t)))
+
+
 def _log(t: Any) -> Any:
     """Logarithm of a slope that cannot be negative but may have underflowed or overflowed."""
     tiny = jnp.finfo(t.dtype).tiny
@@ -201,7 +206,7 @@ CURVES: dict[str, Any] = {
         lambda s: _root(1 - _over(s)),
     ),
     "cbrt": Curve(
-        Piece(jnp.cbrt, "up", (-INF, INF)),
+        Piece(_cube_root, "up", (-INF, INF)),
         Piece(lambda t: 1 / (3 * jnp.square(jnp.cbrt(t))), "peak", (0.0, 0.0), INF),
         lambda s: _over(3 * s) * _root(_over(3 * s)),
     ),

@@ -14,9 +14,23 @@ from typing import Any
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.inclusion import linear, logic
-from gsisio_jax.inclusion.node import Form, Node, as_node, chain, is_node, jac_of, join, parts, settle, slope_of
+from gsisio_jax.inclusion.node import (
+    Form,
+    Node,
+    as_node,
+    chain,
+    fold,
+    is_node,
+    jac_of,
+    join,
+    known_if_concrete,
+    parts,
+    settle,
+    slope_of,
+)
 from gsisio_jax.inclusion.table import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, UnknownPrimitiveError
 from gsisio_jax.interval import Interval
 
@@ -30,7 +44,7 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
     values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
 
     def read(atom: Any) -> Any:
-        return jnp.asarray(atom.val, atom.aval.dtype) if isinstance(atom, jex.Literal) else values[atom]
+        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, jex.Literal) else values[atom]
 
     for eqn in jaxpr.eqns:
         try:
@@ -46,7 +60,7 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
 def _result(eqn: Any, args: Sequence[Any]) -> Any:
     name = eqn.primitive.name
     if not any(is_node(arg) for arg in args):
-        return _call(eqn, *args) if CALLS.get(name) is _call else eqn.primitive.bind(*args, **eqn.params)
+        return _call(eqn, *args) if CALLS.get(name) is _call else _constant(eqn, args)
     by_hand = _BY_HAND.get(name) or _BY_HAND.get(eqn.params.get("name"))
     if by_hand is not None:
         value = settle(_apply_by_hand(by_hand, args))
@@ -60,6 +74,12 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
         value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
         return settle(value) if is_node(value) else value
     raise UnknownPrimitiveError(name)
+
+
+def _constant(eqn: Any, args: Sequence[Any]) -> Any:
+    """Nothing depends on the box: evaluate as usual, while tracing where all numbers are known."""
+    args = [known_if_concrete(arg) for arg in args]
+    return fold(lambda *a: eqn.primitive.bind(*(jnp.asarray(v) for v in a), **eqn.params), *args)
 
 
 def _aligned(args: Sequence[Any], shape: tuple[int, ...]) -> list[Any]:

@@ -17,9 +17,12 @@ from gsisio_jax.inclusion.node import (
     Node,
     as_node,
     chain,
+    fold,
     is_node,
+    is_point,
     jac_of,
     join,
+    known_if_concrete,
     meet,
     parts,
     shift,
@@ -39,8 +42,8 @@ def structural(fn: Callable[..., Any], values: Sequence[Any]) -> list[Node]:
     box, jac = parts(nodes)
 
     def both(pairs: Sequence[Interval], call: Callable[..., Any]) -> list[Interval]:
-        lower = call(*[p.lower for p in pairs])
-        upper = lower if all(p.lower is p.upper for p in pairs) else call(*[p.upper for p in pairs])
+        lower = fold(call, *[p.lower for p in pairs])
+        upper = lower if all(is_point(p) for p in pairs) else fold(call, *[p.upper for p in pairs])
         as_list = list if isinstance(lower, list | tuple) else lambda v: [v]
         return [Interval.unchecked(a, b) for a, b in zip(as_list(lower), as_list(upper), strict=True)]
 
@@ -49,7 +52,7 @@ def structural(fn: Callable[..., Any], values: Sequence[Any]) -> list[Node]:
     forms: list[Any] = [None] * len(ranges)
     jacs: list[Any] = [None] * len(ranges)
     if box is not None:
-        slopes = along(*[slope_of(v, box) for v in nodes])
+        slopes = fold(along, *[slope_of(v, box) for v in nodes])
         slopes = list(slopes) if isinstance(slopes, list | tuple) else [slopes]
         offsets = both([v.offset for v in nodes], fn)
         forms = [Form(s, o, box) for s, o in zip(slopes, offsets, strict=True)]
@@ -60,12 +63,12 @@ def structural(fn: Callable[..., Any], values: Sequence[Any]) -> list[Node]:
 
 def move(fn: Callable[[Any], Any], value: Any) -> Any:
     """`structural` for one value and one result; constants pass through."""
-    return structural(fn, [value])[0] if is_node(value) else fn(jnp.asarray(value))
+    return structural(fn, [value])[0] if is_node(value) else fold(fn, known_if_concrete(value))
 
 
 def multiple(factor: Any, x: Node) -> Node:
     """``factor * x`` for a constant factor."""
-    factor = jnp.asarray(factor).astype(x.dtype)
+    factor = known_if_concrete(factor, x.dtype)
     form = x.form
     if form is not None:
         form = Form(factor * form.slope, stretch(factor, form.offset), form.box)
@@ -74,7 +77,8 @@ def multiple(factor: Any, x: Node) -> Node:
 
 def negative(x: Node) -> Node:
     def flip(a: Interval) -> Interval:
-        return Interval.unchecked(-a.upper, -a.lower)
+        lower = -a.upper
+        return Interval.unchecked(lower, lower if is_point(a) else -a.lower)
 
     form = None if x.form is None else Form(-x.form.slope, flip(x.form.offset), x.form.box)
     return Node(flip(x.range), form, None if x.jac is None else flip(x.jac))
@@ -98,7 +102,7 @@ def add(x: Any, y: Any) -> Node:
 
 
 def subtract(x: Any, y: Any) -> Node:
-    return add(x, negative(y)) if is_node(y) else add(x, -jnp.asarray(y))
+    return add(x, negative(y)) if is_node(y) else add(x, -known_if_concrete(y))
 
 
 def total(node: Node, axes: Sequence[int]) -> Node:

@@ -17,13 +17,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.interval import Interval
 
 
 @jax.custom_jvp
 def times(a: Any, b: Any) -> Any:
-    """``a * b`` with ``0 * inf = 0``; its derivative treats an infinite factor as 0, so gradients stay finite."""
+    """``a * b`` with ``0 * inf = 0``; its derivative treats a factor near infinity as 0, so gradients stay finite."""
     product = a * b
     return jnp.where(jnp.isnan(product), 0, product)
 
@@ -31,7 +32,14 @@ def times(a: Any, b: Any) -> Any:
 @times.defjvp
 def _times_jvp(primals: Any, tangents: Any) -> Any:
     (a, b), (da, db) = primals, tangents
-    return times(a, b), jnp.where(jnp.isfinite(a), a, 0) * db + jnp.where(jnp.isfinite(b), b, 0) * da
+    largest = moderate(jnp.result_type(a, b))
+    return times(a, b), jnp.where(jnp.abs(a) < largest, a, 0) * db + jnp.where(jnp.abs(b) < largest, b, 0) * da
+
+
+def moderate(dtype: Any) -> float:
+    """Numbers above this one overflow as soon as a gradient weighs them."""
+    info = jnp.finfo(dtype)
+    return float(info.max) * float(info.eps) ** 2
 
 
 class Form(eqx.Module):
@@ -80,17 +88,69 @@ def choose(mask: Any, a: Interval, b: Interval) -> Interval:
     return Interval.unchecked(jnp.where(mask, a.lower, b.lower), jnp.where(mask, a.upper, b.upper))
 
 
+def is_known(value: Any) -> bool:
+    """A NumPy array: its numbers are known while tracing. Slopes of affine functions stay of this kind, so that a
+    linear map costs no operation at run time and its signs need no selects."""
+    return isinstance(value, np.ndarray | np.generic)
+
+
+def known_if_concrete(value: Any, dtype: Any = None) -> Any:
+    """As a NumPy array where the numbers can be looked at, else as a JAX array."""
+    if isinstance(value, jax.core.Tracer):
+        return value if dtype is None else value.astype(dtype)
+    value = np.asarray(value)
+    return value.astype(jax.dtypes.canonicalize_dtype(value.dtype if dtype is None else dtype))
+
+
+def fold(call: Any, *values: Any) -> Any:
+    """Call a JAX function, while tracing where all arguments are known."""
+    if not all(is_known(value) for value in values):
+        return call(*values)
+    with jax.ensure_compile_time_eval():
+        return jax.tree.map(np.asarray, call(*values))
+
+
+def is_point(a: Interval) -> bool:
+    """Both sides are the very same array: known to be equal while tracing."""
+    return a.lower is a.upper
+
+
 def shift(a: Interval, b: Interval) -> Interval:
     """Sum of two boxes."""
-    return Interval.unchecked(a.lower + b.lower, a.upper + b.upper)
+    lower = a.lower + b.lower
+    return Interval.unchecked(lower, lower if is_point(a) and is_point(b) else a.upper + b.upper)
 
 
 def stretch(factor: Any, a: Interval) -> Interval:
     """Product of a number and a box."""
+    if is_known(factor):
+        return _stretch_known(factor, a)
+    if is_point(a):
+        value = times(factor, a.lower)
+        return Interval.unchecked(value, value)
     up = factor >= 0
     return Interval.unchecked(
         times(factor, jnp.where(up, a.lower, a.upper)), times(factor, jnp.where(up, a.upper, a.lower))
     )
+
+
+def _stretch_known(factor: Any, a: Interval) -> Interval:
+    """`stretch` by numbers whose signs are known: no test for ``0 * inf`` where none of them is 0."""
+
+    def multiple(value: Any) -> Any:
+        if (factor == 0).all() and is_known(value):
+            return factor * np.zeros_like(value)
+        return jnp.where(factor == 0, 0, factor * value) if (factor == 0).any() else factor * value
+
+    if is_point(a):
+        value = multiple(a.lower)
+        return Interval.unchecked(value, value)
+    up = factor >= 0
+    if up.all():
+        return Interval.unchecked(multiple(a.lower), multiple(a.upper))
+    if not up.any():
+        return Interval.unchecked(multiple(a.upper), multiple(a.lower))
+    return Interval.unchecked(multiple(jnp.where(up, a.lower, a.upper)), multiple(jnp.where(up, a.upper, a.lower)))
 
 
 def product(a: Interval, b: Interval) -> Interval:
@@ -112,6 +172,8 @@ def slope_image(slope: Any, box: Interval) -> Interval:
 
 def guard(a: Interval) -> Interval:
     """After an overflow: a lower bound is never ``inf``, an upper bound never ``-inf``."""
+    if is_known(a.lower) and is_known(a.upper) and np.isfinite(a.lower).all() and np.isfinite(a.upper).all():
+        return a
     largest = jnp.finfo(a.lower.dtype).max
     return Interval.unchecked(jnp.minimum(a.lower, largest), jnp.maximum(a.upper, -largest))
 
@@ -148,7 +210,8 @@ def settle(node: Node) -> Node:
 
 def as_node(value: Any, shape: tuple[int, ...], dtype: Any) -> Node:
     """A constant as a node of one point."""
-    value = jnp.broadcast_to(jnp.asarray(value), shape)
+    value = known_if_concrete(value)
+    value = np.broadcast_to(value, shape) if is_known(value) else jnp.broadcast_to(value, shape)
     value = value if value.dtype == bool else value.astype(dtype)
     return Node(Interval.unchecked(value, value))
 
@@ -166,14 +229,14 @@ def parts(values: Any) -> tuple[Any, Any]:
 def slope_of(node: Node, box: Interval) -> Any:
     if node.form is not None:
         return node.form.slope
-    return jnp.zeros((box.lower.shape[0], *node.shape), node.dtype)
+    return np.zeros((box.lower.shape[0], *node.shape), node.dtype)
 
 
 def jac_of(node: Node, size: int) -> Interval:
     if node.jac is not None:
         return node.jac
     dtype = node.dtype if jnp.issubdtype(node.dtype, jnp.floating) else jnp.result_type(float)
-    zero = jnp.zeros((size, *node.shape), dtype)
+    zero = np.zeros((size, *node.shape), dtype)
     return Interval.unchecked(zero, zero)
 
 

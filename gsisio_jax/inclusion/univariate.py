@@ -133,7 +133,10 @@ class Curve:
         if self.contact is not None:
             wide = (b - a > _NARROW * jnp.maximum(jnp.abs(a), jnp.abs(b))) & jnp.isfinite(pa) & jnp.isfinite(pb)
             secant = jnp.where(wide, pb - pa, 1.0) / jnp.where(wide, b - a, 1.0)
-            touch = self.contact(secant)
+            # Contacts are powers of the secant: where it is extreme, they or their gradients would overflow.
+            largest = float(jnp.finfo(a.dtype).max) ** 0.25
+            wide &= (jnp.abs(secant) < largest) & (jnp.abs(secant) > 1 / largest)
+            touch = self.contact(jnp.where(wide, secant, 1.0))
             touch = jnp.where(m < 0, -touch, touch) if even else jnp.clip(touch, a, b)
             m = jnp.where(wide, touch, m)
         s = self.slope.at(m)
@@ -176,9 +179,7 @@ class Wave:
         s = steepness * half_cos
         odd = jnp.abs(steepness) * jnp.maximum(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
         even = value * (2 * half_cos**2 - 1)
-        rest = Interval.unchecked(
-            jnp.minimum(value, even) - odd - s * m, jnp.maximum(value, even) + odd - s * m
-        )
+        rest = Interval.unchecked(jnp.minimum(value, even) - odd - s * m, jnp.maximum(value, even) + odd - s * m)
         return jnp.where(usable, s, 0), choose(usable, rest, natural)
 
 

@@ -82,9 +82,7 @@ def programs(names):
     return st.lists(step, min_size=1, max_size=3)
 
 
-boxes = st.lists(
-    st.tuples(st.floats(-2, 2), st.sampled_from([0.0, 1e-9, 0.05, 0.5, 1.0, 3.0])), min_size=3, max_size=3
-)
+boxes = st.lists(st.tuples(st.floats(-2, 2), st.sampled_from([0.0, 1e-9, 0.05, 0.5, 1.0, 3.0])), min_size=3, max_size=3)
 
 
 def to_box(sides):
@@ -162,7 +160,9 @@ def test_functions_with_kinks_and_jumps(program, sides):
 
 
 @settings(max_examples=30, deadline=None)
-@given(programs(SMOOTH | KINKED | JUMPING), st.lists(st.sampled_from(["R", "up", "down", "no"]), min_size=3, max_size=3))
+@given(
+    programs(SMOOTH | KINKED | JUMPING), st.lists(st.sampled_from(["R", "up", "down", "no"]), min_size=3, max_size=3)
+)
 def test_infinite_boxes(program, kinds):
     f = build(*zip(*program, strict=True))
     sides = {"R": (-np.inf, np.inf), "up": (-0.5, np.inf), "down": (-np.inf, 0.5), "no": (-1.0, 1.0)}

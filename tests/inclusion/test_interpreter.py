@@ -200,9 +200,7 @@ def test_bounds_by_hand_for_a_primitive_and_for_a_function():
     def sorted_entries(x):
         return jnp.sort(x)
 
-    inclusion.register_bounds(
-        "sorted_entries", lambda x: Interval.unchecked(jnp.sort(x.lower), jnp.sort(x.upper))
-    )
+    inclusion.register_bounds("sorted_entries", lambda x: Interval.unchecked(jnp.sort(x.lower), jnp.sort(x.upper)))
     pair = Interval([0.0, 1.0], [5.0, 2.0])
     form = inclusion.affine(lambda x: sorted_entries(x) + x)(pair)
     np.testing.assert_array_equal(form.slope, np.eye(2))

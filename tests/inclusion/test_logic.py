@@ -200,7 +200,9 @@ def test_angle_is_exact_away_from_the_cut(name):
             assert partial.max() <= jac.upper[i] + 1e-12
 
 
-@pytest.mark.parametrize("sides", [((-1, 1), (-2, -1)), ((-1, 1), (-2, 3)), ((-1, 0), (-2, -1)), ((-INF, INF), (-INF, INF))])
+@pytest.mark.parametrize(
+    "sides", [((-1, 1), (-2, -1)), ((-1, 1), (-2, 3)), ((-1, 0), (-2, -1)), ((-INF, INF), (-INF, INF))]
+)
 def test_angle_across_the_cut(sides):
     f = lambda x: jnp.arctan2(x[0], x[1])  # noqa: E731
     assert pair(inclusion.natural(f)(box(*sides))) == [-np.pi, np.pi]

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from inclusion_points import grid
 from jax import lax
 
 from gsisio_jax import inclusion
 from gsisio_jax.interval import Interval
-from inclusion_points import grid
 
 FUNCTIONS = {
     "sin": jnp.sin,
