@@ -47,7 +47,7 @@ class Certificate(eqx.Module):
     input_noise_v: Any  # |J2|, (p, l)
     steady_width: Any
     input_width: Any
-    equality_residual: float = eqx.field(static=True)
+    equality_residual: Any
     promised: bool = eqx.field(static=True)  # `certified`, known while tracing
     recoverable: bool | None = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)

@@ -33,19 +33,20 @@ class Case:
     def design(self, **options: Any) -> gx.Observer:
         return gx.design_observer(self.system, self.noise, self.region, u_region=self.u_region, **options)
 
-    def simulate(self, key: Any) -> tuple[gx.Simulation, Any]:
+    def simulate(self, key: Any, noise: gx.Noise | None = None, d_scale: Any = 1.0) -> tuple[gx.Simulation, Any]:
         """One run from a random point of the initial box (its faces and corners included). In half of the runs the
         noise lies on the vertices of its box at every step, in the others anywhere in it."""
+        noise = noise or self.noise
         key_x, key_s, key_d, key_w, key_v, key_kind = jax.random.split(key, 6)
         share = jnp.clip(jax.random.uniform(key_x, (self.system.n,), minval=-0.2, maxval=1.2), 0, 1)
         x0 = self.initial.lower + share * self.initial.width
-        d = self.d(key_d, self.steps)
+        d = d_scale * self.d(key_d, self.steps)
         at_vertices = jax.random.bernoulli(key_kind)
-        noise = gx.Noise(
-            _maybe_vertices(at_vertices, key_w, self.noise.w, self.steps),
-            _maybe_vertices(at_vertices, key_v, self.noise.v, self.steps),
+        drawn = gx.Noise(
+            _maybe_vertices(at_vertices, key_w, noise.w, self.steps),
+            _maybe_vertices(at_vertices, key_v, noise.v, self.steps),
         )
-        return gx.simulate(self.system, key_s, x0, d, noise, jnp.asarray(self.u(self.steps))), d
+        return gx.simulate(self.system, key_s, x0, d, drawn, jnp.asarray(self.u(self.steps))), d
 
 
 def _maybe_vertices(chosen: Any, key: Any, box: Interval, steps: int) -> Interval:
@@ -67,14 +68,14 @@ def _s1_g(x):
     return jnp.stack([0.2 * x[0] + 0.65 * x[1] + 0.8 * jnp.sin(0.3 * x[0] + 0.2 * x[1]), jnp.sin(x[0])])
 
 
-def s1(noise: float = 0.2, region: tuple[float, float] = (1.0, 1.5), d_scale: float = 1.0) -> Case:
+def s1(noise: float = 0.2, region: tuple[float, float] = (1.0, 1.5)) -> Case:
     return Case(
         system=gx.System(_s1_f, _s1_g, G=[[0, -0.1], [0.2, -0.2]], H=[[-0.1, 0.3], [0.25, -0.75]]),
         noise=gx.Noise(w=ball([noise] * 2), v=ball([noise] * 2)),
         initial=Interval([-1.1, -2.0], [2.0, 1.1]),
         region=ball(region),
         steps=60,
-        d=lambda key, steps: d_scale * jax.random.normal(key, (steps, 2)),
+        d=lambda key, steps: jax.random.normal(key, (steps, 2)),
     )
 
 

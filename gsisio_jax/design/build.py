@@ -207,7 +207,7 @@ def _assemble(
         input_noise_v=np.abs(J2),
         steady_width=steady,
         input_width=input_width,
-        equality_residual=float(np.abs(problem.residual(main)[:, problem.free]).max(initial=0.0)),
+        equality_residual=np.abs(problem.residual(main)[:, problem.free]).max(initial=0.0),
         promised=certified,
         recoverable=None,
         notes=(feedthrough.note,) if feedthrough.note else (),

@@ -57,8 +57,8 @@ def check_first_sweep(problem: GainProblem, gain: np.ndarray, form: inclusion.Af
         return
     raise NoDesignFound(
         "design_observer: the box of x[k] would never become finite. On the state bounds the affine bounds of the "
-        f"outputs {'lose a direction' if finite else 'have an infinite remainder'}, and their nonlinearity is too "
-        "strong for the closed form (rho(|N_z| R) >= 1 there). Give `state_bounds` that are finite where the outputs are "
+        f"outputs {'lose a direction' if finite else 'have an infinite remainder'}, and they are too nonlinear "
+        "for the closed form (rho(|N_z| R) >= 1 there). Give `state_bounds` that are finite where the outputs are "
         "nonlinear; a smaller region alone does not help."
     )
 

@@ -76,7 +76,7 @@ def _unknown_where(mask: Any, x: Node) -> Node:
 
 def pick(mask: Any, x: Node, y: Node) -> Node:
     """Elementwise `x` where the mask (not a node) holds, else `y`."""
-    return structural(lambda a, b: jnp.where(mask, a, b), [x, y])[0]
+    return structural(lambda a, b: jnp.where(mask, a, b), [x, y], [mask])[0]
 
 
 def raise_to(x: Any, p: Any) -> Node:

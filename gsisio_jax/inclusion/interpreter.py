@@ -15,6 +15,7 @@ import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from gsisio_jax.inclusion import linear, logic
 from gsisio_jax.inclusion.node import (
@@ -44,7 +45,10 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
     values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *args], strict=True))
 
     def read(atom: Any) -> Any:
-        return np.asarray(atom.val, atom.aval.dtype) if isinstance(atom, jex.Literal) else values[atom]
+        if not isinstance(atom, jex.Literal):
+            return values[atom]
+        aval: Any = atom.aval
+        return np.asarray(atom.val, aval.dtype)
 
     for eqn in jaxpr.eqns:
         try:
@@ -119,7 +123,7 @@ def _call(eqn: Any, *args: Any) -> Any:
 
 def _cond(eqn: Any, index: Any, *args: Any) -> Any:
     branches = eqn.params["branches"]
-    if not is_node(index) and not isinstance(index, jax.core.Tracer):
+    if not is_node(index) and not isinstance(index, Tracer):
         chosen = branches[min(max(int(index), 0), len(branches) - 1)]
         return evaluate(chosen.jaxpr, chosen.consts, args)
     outcomes = [evaluate(branch.jaxpr, branch.consts, args) for branch in branches]
@@ -176,7 +180,7 @@ def _loop(turn: Callable[..., Any], carry: list[Any], xs: Sequence[Any], length:
     def inward(x: Any) -> Any:
         if not isinstance(x, tuple):
             return x
-        return Node(x[0], None if x[1] is None else Form(*x[1], box), x[2])
+        return Node(x[0], None if x[1] is None else Form(x[1][0], x[1][1], box), x[2])
 
     def stacked(x: Any) -> Any:
         return Node(x[0], *_unstack(x[1], x[2], box)) if isinstance(x, tuple) else x

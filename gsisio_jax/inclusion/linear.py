@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.inclusion.node import (
     Form,
@@ -29,21 +30,23 @@ from gsisio_jax.inclusion.node import (
     slope_of,
     stretch,
 )
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval import Interval, is_concrete
 
 
-def structural(fn: Callable[..., Any], values: Sequence[Any]) -> list[Node]:
+def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[Any] = ()) -> list[Node]:
     """Apply `fn`, linear with nonnegative weights and no offset, to a list of constants and nodes.
 
-    `fn` takes as many arrays as there are values and returns one array or a list of them.
+    `fn` takes as many arrays as there are values and returns one array or a list of them. `fixed` are the arrays that
+    it holds besides (masks, indices): if they are not known while tracing, nothing that comes out is.
     """
     dtype = next(v.dtype for v in values if is_node(v))
     nodes = [v if is_node(v) else as_node(v, jnp.shape(v), dtype) for v in values]
     box, jac = parts(nodes)
+    run = fold if all(is_concrete(v) for v in fixed) else _call
 
     def both(pairs: Sequence[Interval], call: Callable[..., Any]) -> list[Interval]:
-        lower = fold(call, *[p.lower for p in pairs])
-        upper = lower if all(is_point(p) for p in pairs) else fold(call, *[p.upper for p in pairs])
+        lower = run(call, *[p.lower for p in pairs])
+        upper = lower if all(is_point(p) for p in pairs) else run(call, *[p.upper for p in pairs])
         as_list = list if isinstance(lower, list | tuple) else lambda v: [v]
         return [Interval.unchecked(a, b) for a, b in zip(as_list(lower), as_list(upper), strict=True)]
 
@@ -52,13 +55,17 @@ def structural(fn: Callable[..., Any], values: Sequence[Any]) -> list[Node]:
     forms: list[Any] = [None] * len(ranges)
     jacs: list[Any] = [None] * len(ranges)
     if box is not None:
-        slopes = fold(along, *[slope_of(v, box) for v in nodes])
+        slopes = run(along, *[slope_of(v, box) for v in nodes])
         slopes = list(slopes) if isinstance(slopes, list | tuple) else [slopes]
         offsets = both([v.offset for v in nodes], fn)
         forms = [Form(s, o, box) for s, o in zip(slopes, offsets, strict=True)]
     if jac is not None:
         jacs = both([jac_of(v, jac.lower.shape[0]) for v in nodes], along)
     return [Node(*triple) for triple in zip(ranges, forms, jacs, strict=True)]
+
+
+def _call(fn: Callable[..., Any], *values: Any) -> Any:
+    return fn(*values)
 
 
 def move(fn: Callable[[Any], Any], value: Any) -> Any:
@@ -89,13 +96,13 @@ def add(x: Any, y: Any) -> Node:
     if not is_node(x):
         x, y = y, x
     if not is_node(y):
-        y = as_node(y, jnp.broadcast_shapes(x.shape, jnp.shape(y)), x.dtype)
+        y = as_node(y, np.broadcast_shapes(x.shape, np.shape(y)), x.dtype)
     form = x.form if y.form is None else y.form
     total = shift(x.range, y.range)
     if form is None:
         return Node(total, None, join(x.jac, y.jac))
     both = x.form is not None and y.form is not None
-    slope = x.form.slope + y.form.slope if both else form.slope
+    slope = x.form.slope + y.form.slope if x.form is not None and y.form is not None else form.slope
     node = Node(total, Form(slope, shift(x.offset, y.offset), form.box), join(x.jac, y.jac))
     # With one form only there is nothing to cancel, and the range is what it was, moved.
     return meet(node) if both else node

@@ -221,7 +221,7 @@ def select(which: Any, *cases: Any) -> Any:
     """``lax.select_n``: the decided case, or the hull of the cases that are possible."""
     if not is_node(which):
         if any(is_node(case) for case in cases):
-            return structural(lambda *values: _select_plain(which, *values), cases)[0]
+            return structural(lambda *values: _select_plain(which, *values), cases, [which])[0]
         return _select_plain(which, *cases)
     low, high = which.range.lower, which.range.upper
     if low.dtype == bool:

@@ -18,6 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from gsisio_jax.interval import Interval
 
@@ -96,7 +97,7 @@ def is_known(value: Any) -> bool:
 
 def known_if_concrete(value: Any, dtype: Any = None) -> Any:
     """As a NumPy array where the numbers can be looked at, else as a JAX array."""
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return value if dtype is None else value.astype(dtype)
     value = np.asarray(value)
     return value.astype(jax.dtypes.canonicalize_dtype(value.dtype if dtype is None else dtype))
@@ -123,7 +124,7 @@ def shift(a: Interval, b: Interval) -> Interval:
 
 def stretch(factor: Any, a: Interval) -> Interval:
     """Product of a number and a box."""
-    if is_known(factor):
+    if is_known(factor) and np.isfinite(factor).all():
         return _stretch_known(factor, a)
     if is_point(a):
         value = times(factor, a.lower)
@@ -194,7 +195,9 @@ def best_form(slope: Any, offset: Interval, natural: Interval, box: Interval) ->
     finished form is given slope 0.
     """
     width = offset.upper - offset.lower
-    good = jnp.isfinite(width) & (width <= natural.upper - natural.lower)
+    # At width 0 both are equally good but for rounding, and there the slope must not be lost.
+    rounding = 8 * jnp.finfo(width.dtype).eps * (jnp.abs(offset.lower) + jnp.abs(natural.lower))
+    good = jnp.isfinite(width) & (width - rounding <= natural.upper - natural.lower)
     return Form(jnp.where(good, slope, 0), choose(good, offset, natural), box)
 
 

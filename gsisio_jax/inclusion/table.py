@@ -51,7 +51,8 @@ def _structural(*data: int) -> Rule:
                 fixed[i] = value
             return eqn.primitive.bind(*fixed, **eqn.params)
 
-        nodes = linear.structural(call, [args[i] for i in where])
+        rest = [arg for i, arg in enumerate(args) if i not in where]
+        nodes = linear.structural(call, [args[i] for i in where], rest)
         return nodes if eqn.primitive.multiple_results else nodes[0]
 
     return rule

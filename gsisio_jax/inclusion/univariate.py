@@ -154,8 +154,8 @@ class Curve:
 class Wave:
     """``sin`` or ``cos``: crests at ``crest + 2 k pi``.
 
-    Everything follows from the middle m and the half-width r alone: ``phi(m + h) = phi(m) cos h + phi'(m) sin h``. Range
-    and line then share four sines and cosines, which are what a wave costs.
+    Everything follows from the middle m and the half-width r alone: ``phi(m + h) = phi(m) cos h + phi'(m) sin h``.
+    Range and line then share four sines and cosines, which are what a wave costs.
     """
 
     fn: Callable[[Any], Any]

@@ -22,37 +22,26 @@ def tanks(x):
     return x + flow - h * k * s * r
 
 
-def robot(x):
-    px, py, th = x
-    near = jnp.sqrt((5 - px) ** 2 + (15 - py) ** 2)
-    return jnp.stack([px + 0.3 * jnp.cos(th), py + 0.3 * jnp.sin(th), near, th - jnp.arctan((15 - py) / (5 - px))])
-
-
 # Kinks, ties, poles, flat ends, ends of domains; all act on entries or on pairs of them, so they share compiled code.
 DELICATE = {
-    "waves": lambda x: jnp.sin(x) * x[::-1] + jnp.cos(3 * x),
     "roots": lambda x: jnp.sqrt(x) + x**0.3 - jnp.cbrt(x),
-    "growth": lambda x: jnp.exp(x) + x**3 - jnp.tanh(x),
-    "logarithms": lambda x: x * jnp.log(x) + jnp.logaddexp(x, x[::-1]),
+    "growth": lambda x: jnp.exp(x) + x**3 + x * jnp.log(x),
     "quotients": lambda x: x / jnp.abs(x[::-1]) + jnp.tan(x),
-    "kinks": lambda x: jnp.max(x) + jax.nn.relu(x) - jnp.clip(x, -1, 1),
-    "jumps": lambda x: jnp.where(x > 0, x, x[::-1]) + jnp.floor(x) + jnp.mod(x, 2.0),
+    "kinks": lambda x: jnp.max(x) + jnp.where(x > 0, x, x[::-1]) + jnp.mod(x, 2.0),
     "plane": lambda x: jnp.arctan2(x, x[::-1]) + jnp.linalg.norm(x) - jnp.arcsin(x),
 }
 
 
 @pytest.mark.parametrize("bound", BOUNDS, ids=lambda bound: bound.__name__)
 def test_jit_and_vmap_equal_a_loop(bound):
+    f = lambda x: jnp.stack([x[0] * jnp.cos(x[2]), jnp.sqrt((5 - x[0]) ** 2 + x[1] ** 2), x[2] - x[1]])  # noqa: E731
     rng = np.random.default_rng(1)
-    lower = np.array([2.0, 12.0, 0.1]) + rng.uniform(-1, 1, (5, 3))
-    boxes = Interval(lower, lower + rng.uniform(0, 0.5, (5, 3)))
-    call = jax.jit(bound(robot))
-    batch = jax.jit(jax.vmap(bound(robot)))(boxes)
-    for i in range(5):
-        one, plain = call(boxes[i]), bound(robot)(boxes[i])
-        for a, b, c in zip(*(jax.tree.leaves(v) for v in (batch, one, plain)), strict=True):
+    lower = np.array([2.0, 12.0, 0.1]) + rng.uniform(-1, 1, (3, 3))
+    boxes = Interval(lower, lower + rng.uniform(0, 0.5, (3, 3)))
+    batch = jax.jit(jax.vmap(bound(f)))(boxes)
+    for i in range(3):
+        for a, b in zip(jax.tree.leaves(batch), jax.tree.leaves(bound(f)(boxes[i])), strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-12, atol=1e-12)
-            np.testing.assert_allclose(b, c, rtol=1e-12, atol=1e-12)
 
 
 def test_vmap_over_an_argument():
@@ -105,7 +94,8 @@ SIDES = {
 def flat_bounds(f, lower, upper, *args):
     """Every number that comes out for f, in one row."""
     box = Interval.unchecked(lower, upper)
-    return jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves([bound(f)(box, *args) for bound in BOUNDS[1:]])])
+    leaves = jax.tree.leaves((inclusion.affine(f)(box, *args), inclusion.jacobian(f)(box, *args)))
+    return jnp.concatenate([leaf.ravel() for leaf in leaves])
 
 
 @pytest.mark.parametrize("name", DELICATE)
@@ -123,11 +113,8 @@ def test_gradients_are_finite(name):
 
 
 @pytest.mark.parametrize("f", [
-    lambda x, a: jnp.sin(a * x) * x[::-1] + jnp.cos(3 * x + a),
-    lambda x, a: jnp.sqrt(x + 1) + jnp.tanh(x) + jnp.exp(a * x) / (x + 2),
-    lambda x, a: jnp.log(x + 2) - x**3 + jnp.arctan(x - a),
-    lambda x, a: jnp.maximum(x, 0.1 * x[::-1]) + jnp.abs(x) + a * x * x,
-    lambda x, a: jnp.arctan2(x + 1, x[::-1] + a) + jnp.linalg.norm(x + 1),
+    lambda x, a: jnp.sin(a * x) * x[::-1] + jnp.tanh(x) - a * x**3,
+    lambda x, a: jnp.sqrt(x + 1) + jnp.maximum(x, 0.1 * x[::-1]) + jnp.exp(a * x) / (x + 2),
 ])  # fmt: skip
 def test_gradients_match_finite_differences(f):
     def flat(p):
@@ -142,8 +129,8 @@ def test_gradients_match_finite_differences(f):
 
 def test_float32_in_float32_out():
     box = Interval(np.array([-1, 0.5], np.float32), np.array([1, 2], np.float32))
-    for f in DELICATE.values():
-        for leaf in jax.tree.leaves((inclusion.affine(f)(box), inclusion.jacobian(f)(box))):
+    for name in ("roots",):
+        for leaf in jax.tree.leaves([bound(DELICATE[name])(box) for bound in BOUNDS]):
             assert leaf.dtype == jnp.float32
             assert not np.isnan(leaf).any()
     x = np.random.default_rng(0).uniform(box.lower, box.upper, (200, 2))
@@ -176,7 +163,7 @@ def test_unknown_operation_is_named_with_its_place():
     line = f.__code__.co_firstlineno + 1
     with pytest.raises(inclusion.UnknownPrimitiveError, match=rf"`sort`.*test_interpreter\.py:{line}.*register_bounds"):
         inclusion.natural(f)(Interval([0.0, 1.0], [1.0, 2.0]))
-    with pytest.raises(inclusion.UnknownPrimitiveError, match="dynamic_slice.*indices that depend on the box"):
+    with pytest.raises(inclusion.UnknownPrimitiveError, match=r"dynamic_slice.*indices that depend on the box"):
         inclusion.natural(lambda x: lax.dynamic_slice(x, (x[0].astype(int),), (1,)))(Interval([0.0, 1.0], [1.0, 2.0]))
     # What does not depend on the box needs no bounds.
     assert inclusion.natural(lambda x, a: x + jnp.sort(a)[0])(Interval([0.0], [1.0]), jnp.array([3.0, 2.0])).lower == 2
@@ -220,11 +207,11 @@ def test_a_box_of_another_shape_is_refused(box):
 def test_long_scan_equals_the_unrolled_one():
     def turn(c, a):
         level, count = c
-        level = 0.9 * level + 0.1 * jnp.sin(level) * a
+        level = 0.9 * level + 0.1 * jnp.tanh(level) * a
         return (level, count + 1), level[0] + count
 
-    f = lambda x: lax.scan(turn, (x, 0.0), x[0] * jnp.arange(18.0) / 18)  # noqa: E731
-    g = lambda x: lax.scan(turn, (x, 0.0), x[0] * jnp.arange(18.0) / 18, unroll=18)  # noqa: E731
+    def f(x):
+        return lax.scan(turn, (x, 0.0), x[0] * jnp.arange(18.0) / 18)
 
     def by_hand(x):
         c, out = (x, 0.0), []
@@ -234,10 +221,9 @@ def test_long_scan_equals_the_unrolled_one():
         return c, jnp.stack(out)
 
     box = Interval([0.2, -0.4], [0.5, 0.1])
-    for bound in (inclusion.natural, inclusion.affine, inclusion.jacobian):
-        for other in (g, by_hand):
-            for a, b in zip(jax.tree.leaves(bound(f)(box)), jax.tree.leaves(bound(other)(box)), strict=True):
-                np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-13)
+    for bound in (inclusion.affine, inclusion.jacobian):
+        for a, b in zip(jax.tree.leaves(bound(f)(box)), jax.tree.leaves(bound(by_hand)(box)), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-13)
 
 
 def test_gradient_rules_of_a_function_are_ignored():

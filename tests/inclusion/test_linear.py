@@ -52,8 +52,7 @@ AFFINE = {
 }
 BOXES = {
     "finite": Interval([-1.0, 0.5, 2.0], [1.0, 0.75, 2.0]),
-    "half": Interval([-np.inf, 0.0, 1.0], [1.0, np.inf, 2.0]),
-    "entire": Interval.entire(3),
+    "some sides infinite": Interval([-np.inf, 0.0, -np.inf], [1.0, np.inf, np.inf]),
 }
 
 

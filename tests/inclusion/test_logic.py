@@ -172,9 +172,12 @@ def test_remainders(a, width):
 
 
 ANGLES = {
-    "first": ((1, 2), (1, 3)), "second": ((1, 2), (-3, -1)), "third": ((-2, -1), (-3, -1)), "fourth": ((-2, -1), (1, 3)),
-    "right": ((-2, 1), (0.5, 3)), "up": ((0.5, 1), (-2, 3)), "down": ((-1, -0.5), (-2, 3)), "point": ((0.3, 0.3), (-1, -1)),
-    "corner at the origin": ((0, 1), (0, 1)), "edge through the origin": ((-1, 1), (0, 2)), "upper half": ((0, 2), (-1, 1)),
+    "first": ((1, 2), (1, 3)), "second": ((1, 2), (-3, -1)), "third": ((-2, -1), (-3, -1)),
+    "fourth": ((-2, -1), (1, 3)),
+    "right": ((-2, 1), (0.5, 3)), "up": ((0.5, 1), (-2, 3)), "down": ((-1, -0.5), (-2, 3)),
+    "point": ((0.3, 0.3), (-1, -1)),
+    "corner at the origin": ((0, 1), (0, 1)), "edge through the origin": ((-1, 1), (0, 2)),
+    "upper half": ((0, 2), (-1, 1)),
 }  # fmt: skip
 
 

@@ -42,7 +42,10 @@ def _draw(rng, lower, upper, count):
 
 
 def grid(a: float, b: float, count: int = 20001) -> np.ndarray:
-    """A dense grid of an interval, both ends (and 0, where functions turn) in it; infinite ends are followed out on a logarithmic scale."""
+    """A dense grid of an interval, both ends (and 0, where functions turn) in it.
+
+    Infinite ends are followed out on a logarithmic scale.
+    """
     far = 10.0 ** np.linspace(-3, 8, count)
     if np.isfinite(a) and np.isfinite(b):
         t = np.linspace(a, b, count)
