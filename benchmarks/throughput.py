@@ -15,6 +15,8 @@ import gsisio_jax as gx
 from benchmarks.plants import case, from_tests, records
 from gsisio_jax.observer import advance, begin
 
+ROUNDING = 1e-12  # half of the records have noise on its very bounds, reached only up to rounding
+LONG = 20.0  # seconds: calls that take longer are timed once after the warm one
 REPEATS = 3
 AGREEMENT = 1e-9
 
@@ -87,8 +89,10 @@ def _compiled(batch: int, steps: int, keep: Callable[[Any], Any]) -> dict[str, A
     started = time.perf_counter()
     program = run.lower(*args).compile()
     compile_seconds = time.perf_counter() - started
+    started = time.perf_counter()
     result = jax.block_until_ready(program(*args))
-    seconds, cpu_seconds = min(_timed(program, args) for _ in range(REPEATS))
+    repeats = 1 if time.perf_counter() - started > LONG else REPEATS
+    seconds, cpu_seconds = min(_timed(program, args) for _ in range(repeats))
     peak = _peak() - before
     return {
         "batch": batch,
@@ -106,11 +110,11 @@ def _checked(run: Any, observer: Any, args: Any, x: np.ndarray, result: Any) -> 
     """Boxes contain the truth. Where they were not kept, a small part of the batch is computed again, and its last
     widths compared with the kept ones."""
     if isinstance(result, tuple):
-        sound = bool(np.asarray(result[0].contains(x)).all())
+        sound = bool(np.asarray(result[0].contains(x, -ROUNDING)).all())
         return {"sound": sound, "ok": sound}
     part = jax.tree.map(lambda a: a[:1000], args)
     boxes = jax.jit(jax.vmap(lambda box, y: gx.estimate(observer, box, y).state))(*part)
-    sound = bool(np.asarray(boxes.contains(x[:1000])).all())
+    sound = bool(np.asarray(boxes.contains(x[:1000], -ROUNDING)).all())
     widths = np.asarray(boxes.width[:, -1])
     gap = float(np.abs(widths - np.asarray(result)[:1000]).max() / widths.max())
     return {"sound": sound, "gap": gap, "ok": sound and gap < AGREEMENT and bool(np.isfinite(result).all())}

@@ -157,7 +157,8 @@ CURVES: dict[str, Any] = {
     ),
     "tanh": Curve(
         Piece(jnp.tanh, "up", (-1.0, 1.0)),
-        Piece(lambda t: 1 - jnp.square(jnp.tanh(t)), "peak", (0.0, 0.0), 1.0),
+        # 1 - tanh^2, without the cancellation.
+        Piece(lambda t: 4 * jax.nn.sigmoid(2 * t) * jax.nn.sigmoid(-2 * t), "peak", (0.0, 0.0), 1.0),
         lambda s: 0.5 * (_log(1 + _root(1 - s)) - _log(1 - _root(1 - s))),
     ),
     "logistic": Curve(

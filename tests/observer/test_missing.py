@@ -141,7 +141,7 @@ def test_a_lost_row_without_state_bounds(name, recovers):
     assert observer.certificate.recoverable is recovers
     assert f"is {'' if recovers else 'NOT '}recovered" in str(observer.certificate)
     steps, lost = case.system.n + 5, 3
-    record, d = case.simulate(jax.random.key(5), steps)
+    record, d = replace(case, steps=steps).simulate(jax.random.key(5))
     y = np.array(record.y)
     y[lost] = np.nan
     # As many rows as the design itself tried, and no mark of its answer: what it compiled serves here too.
