@@ -114,6 +114,9 @@ def test_products_use_the_tightest_planes():
     np.testing.assert_allclose(form.slope, [4, 2])
     # x y - 4 x - 2 y + 8 = (x - 2)(y - 4), between -2 and 2.
     np.testing.assert_allclose([form.offset.lower, form.offset.upper], [-10, -6])
+    moved = inclusion.affine(lambda x: (x[0] + 1) * (x[1] - 2))(Interval([0.0, 4.0], [2.0, 8.0]))
+    np.testing.assert_allclose(moved.slope, [4, 2])
+    np.testing.assert_allclose([moved.offset.lower, moved.offset.upper], [-10, -6])
 
 
 def test_meeting_at_inner_nodes_tightens():
