@@ -5,15 +5,16 @@ from typing import TYPE_CHECKING, Any
 from gsisio_jax import estimation, inclusion
 from gsisio_jax.alarms import Alarm
 from gsisio_jax.certificate import Certificate
-from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
+from gsisio_jax.errors import FramerNotGuaranteed, NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.estimation import Estimate, estimate, start, step
 from gsisio_jax.interval import Interval, hull, intersect, linear_image
 from gsisio_jax.observer import Carry, Observer, StepOutput
+from gsisio_jax.prediction import PredictionObserver
 from gsisio_jax.status import Status
 from gsisio_jax.system import Noise, Simulation, System, simulate
 
 if TYPE_CHECKING:
-    from gsisio_jax import dataset, examples, plot
+    from gsisio_jax import dataset, examples, paper, plot
     from gsisio_jax.design import design_observer
 
 __version__ = "0.1.0"
@@ -23,11 +24,13 @@ __all__ = [
     "Carry",
     "Certificate",
     "Estimate",
+    "FramerNotGuaranteed",
     "Interval",
     "NoDesignFound",
     "Noise",
     "Observer",
     "ObserverDoesNotExist",
+    "PredictionObserver",
     "Simulation",
     "Status",
     "StepOutput",
@@ -41,13 +44,14 @@ __all__ = [
     "inclusion",
     "intersect",
     "linear_image",
+    "paper",
     "plot",
     "simulate",
     "start",
     "step",
 ]
 
-_LAZY = {"design_observer": "gsisio_jax.design", "dataset": "", "examples": "", "plot": ""}
+_LAZY = {"design_observer": "gsisio_jax.design", "dataset": "", "examples": "", "paper": "", "plot": ""}
 
 
 def __getattr__(name: str) -> Any:

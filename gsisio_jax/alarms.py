@@ -18,8 +18,9 @@ class Alarm:
     Attributes:
         step: index k.
         kind: which intersection was empty: "initial" (initial box and state bounds), "output" (a measurement and the
-            box), "state" (the box carried from the past and the box so far), "dynamics", "input" or "certificate".
-        index: the component: a state, a row of T2, or an input.
+            box), "state" (the box carried from the past and the box so far), "dynamics", "input", "certificate", or
+            "balance" (a combination of dynamics and outputs that no unknown input can explain).
+        index: the component: a state, a row of T2, an input, or a circuit of [G; H].
         outputs: the outputs that enter that row, for kind "output".
         gap: by how much the two pieces miss each other, in the unit of the component.
 
@@ -55,6 +56,11 @@ class Alarm:
             gap = f"{_plain(self.gap)}{_unit(input_units, self.index)}"
             return (
                 f"{_pick(input_names, self.index, 'input')}: the bounds of the unknown input miss each other by {gap}"
+            )
+        if self.kind == "balance":
+            return (
+                "no unknown input explains both the change of the states and the measurements before it, combination "
+                f"{self.index + 1} of the two misses by {_plain(self.gap)}"
             )
         name, gap = _pick(state_names, self.index, "state"), f"{_plain(self.gap)}{_unit(state_units, self.index)}"
         if self.kind == "initial":

@@ -19,7 +19,7 @@ class Certificate(eqx.Module):
 
     Attributes:
         certified: the width recursion contracts (`rate` < 1).
-        rate: spectral radius of ``A + |N_z| R``.
+        rate: spectral radius of ``A + |N_z| R`` (prediction form: ``|G||J1|`` in the place of ``|N_z| R``).
         implicit_rate: spectral radius of ``|N_z| R`` on the region; below 1 the box of x[k] is finite.
         steady_width: (n,) width that the state boxes settle at or below, design noise; ``inf`` if not certified.
         input_width: (p,) the same for the input boxes.
@@ -31,6 +31,7 @@ class Certificate(eqx.Module):
         equality_residual: largest entry of ``G - N_y H - N_z C G`` in the columns of free inputs.
         recoverable: after one lost row of measurements the boxes become finite again (None: not examined).
         notes: what a reader should know besides.
+        framer: the boxes are certain; False only for a prediction form that is none and was asked for all the same.
 
     Source: design 4.2 and 4.4.
     """
@@ -51,6 +52,7 @@ class Certificate(eqx.Module):
     promised: bool = eqx.field(static=True)  # `certified`, known while tracing
     recoverable: bool | None = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
+    framer: bool = eqx.field(static=True, default=True)
 
     @property
     def rate(self) -> float:
@@ -105,7 +107,7 @@ class Certificate(eqx.Module):
 
     def __str__(self) -> str:
         lines = [self._headline()]
-        lines.append(f"  rate {self.rate:.6g} per step · |N_z|R {self.implicit_rate:.3g} · equality residual "
+        lines.append(f"  rate {self.rate:.6g} per step · implicit part {self.implicit_rate:.3g} · equality residual "
                      f"{self.equality_residual:.1e}")  # fmt: skip
         lines.append(f"  {'':<10}{'steady width':>14}{'region width':>14}{'slack':>14}")
         region_width = np.asarray(self.region.width)
@@ -119,6 +121,8 @@ class Certificate(eqx.Module):
         return "\n".join(lines)
 
     def _headline(self) -> str:
+        if not self.framer:
+            return "Certificate: NONE. This recursion is NO framer: its boxes may cross and miss the truth."
         if not self.certified:
             return "Certificate: NONE. The boxes are certain, but no bound on their width is promised."
         if not self.self_consistent:

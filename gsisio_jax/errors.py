@@ -16,3 +16,10 @@ class NoDesignFound(ValueError):
 
     Source: design 4.1.
     """
+
+
+class FramerNotGuaranteed(ValueError):
+    """The paper's recursion (prediction form) is no framer for this system: rho(|G||J1|) >= 1.
+
+    ``allow_uncertified=True`` runs it all the same, to be looked at. Source: design 3, P3.
+    """

@@ -11,20 +11,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax import prediction, recursion
 from gsisio_jax.alarms import Alarm, read_alarms
 from gsisio_jax.interval import Interval, is_concrete
-from gsisio_jax.observer import Carry, Observer, StepOutput, begin
-from gsisio_jax.observer import advance as _advance
+from gsisio_jax.observer import Carry, Observer, StepOutput, cast
+from gsisio_jax.prediction import PredictionObserver
 from gsisio_jax.system import Noise
 
 OnConflict = Literal["restart", "hold"]
+AnyObserver = Observer | PredictionObserver
 
 
 class Estimate(eqx.Module):
     """Boxes of a record; a pytree. Under `jax.vmap` every array gains the batch axes in front.
 
     Attributes:
-        state: box of x[k] from y[0..k], (T, n).
+        state: box of x[k] from y[0..k], (T, n); from y[0..k-1] in the prediction form.
         input: box of d[k] from y[0..k+1], (T-1, p).
         current_input: box of V1' d[k] from y[0..k], (T, p_H).
         status: `Status` bit mask, (T,).
@@ -53,7 +55,7 @@ class Estimate(eqx.Module):
 
 
 def estimate(
-    observer: Observer,
+    observer: AnyObserver,
     initial: Interval,
     y: Any,
     u: Any = None,
@@ -87,12 +89,13 @@ def estimate(
     """
     initial, y, u, noise, observer = _prepare("estimate", observer, initial, y, u, noise, rows=True)
     if length is not None:
+        _check_length(length, y.shape[0])
         y = jnp.where((jnp.arange(y.shape[0]) < length)[:, None], y, jnp.nan)
     return _estimate(observer, initial, y, u, noise, _hold("estimate", on_conflict))
 
 
 def start(
-    observer: Observer,
+    observer: AnyObserver,
     initial: Interval,
     y0: Any,
     u0: Any = None,
@@ -119,7 +122,7 @@ def start(
 
 
 def step(
-    observer: Observer,
+    observer: AnyObserver,
     carry: Carry,
     y_k: Any,
     u_k: Any = None,
@@ -141,12 +144,13 @@ def step(
 
     Source: design 7.
     """
-    _, y_k, u_k, noise, observer = _prepare("step", observer, carry.state, y_k, u_k, noise, rows=False)
-    return _step(observer, carry, y_k, u_k, noise, _hold("step", on_conflict))
+    box, y_k, u_k, noise, observer = _prepare("step", observer, carry.state, y_k, u_k, noise, rows=False)
+    # A carry of lower precision is widened to that of the data; nothing is lost.
+    return _step(observer, cast(carry, box.dtype), y_k, u_k, noise, _hold("step", on_conflict))
 
 
 def resume(
-    observer: Observer,
+    observer: AnyObserver,
     carry: Carry,
     y: Any,
     u: Any = None,
@@ -158,39 +162,39 @@ def resume(
     Returns:
         The carry after the last row, and a `StepOutput` whose arrays have one row per row of `y`.
     """
-    _, y, u, noise, observer = _prepare("resume", observer, carry.state, y, u, noise, rows=True)
-    return _resume(observer, carry, y, u, noise, _hold("resume", on_conflict))
+    box, y, u, noise, observer = _prepare("resume", observer, carry.state, y, u, noise, rows=True)
+    return _resume(observer, cast(carry, box.dtype), y, u, noise, _hold("resume", on_conflict))
 
 
-def collect(observer: Observer, outputs: Sequence[StepOutput]) -> Estimate:
+def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
     """Join the outputs of `start`, `step` and `resume`, in order, into the `Estimate` of the whole record."""
     rows = [jax.tree.map(lambda x: x[None], out) if jnp.ndim(out.status) == 0 else out for out in outputs]
     return _as_estimate(observer, jax.tree.map(lambda *x: jnp.concatenate(x), *rows))
 
 
 @partial(jax.jit, static_argnames="hold")
-def _estimate(observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Estimate:
-    carry, first = begin(observer, initial, y[0], u[0], _row(noise, 0), hold)
+def _estimate(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Estimate:
+    carry, first = _recursion(observer).begin(observer, initial, y[0], u[0], _row(noise, 0), hold)
     _, rest = _scan(observer, carry, y[1:], u[1:], _rows_from(noise, 1), hold)
     return _as_estimate(observer, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest))
 
 
 @partial(jax.jit, static_argnames="hold")
-def _start(observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
-    return begin(observer, initial, y, u, noise, hold)
+def _start(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    return _recursion(observer).begin(observer, initial, y, u, noise, hold)
 
 
 @partial(jax.jit, static_argnames="hold")
-def _step(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
-    return _advance(observer, carry, y, u, noise, hold)
+def _step(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    return _recursion(observer).advance(observer, carry, y, u, noise, hold)
 
 
 @partial(jax.jit, static_argnames="hold")
-def _resume(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+def _resume(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     return _scan(observer, carry, y, u, noise, hold)
 
 
-def _scan(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
+def _scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
     """Bounds that change with time travel with the rows; constant ones stay outside the loop."""
     varying = Noise.unchecked(*(box if len(box.shape) == 2 else None for box in (noise.w, noise.v)))
 
@@ -200,9 +204,14 @@ def _scan(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: 
             noise.w if now.w is None else now.w,
             noise.v if now.v is None else now.v,
         )
-        return _advance(observer, carry, y_k, u_k, bounds, hold)
+        return _recursion(observer).advance(observer, carry, y_k, u_k, bounds, hold)
 
     return jax.lax.scan(body, carry, (y, u, varying))
+
+
+def _recursion(observer: AnyObserver) -> Any:
+    """The module whose `begin` and `advance` belong to this kind of observer."""
+    return prediction if isinstance(observer, PredictionObserver) else recursion
 
 
 def _row(noise: Noise, k: int) -> Noise:
@@ -213,7 +222,7 @@ def _rows_from(noise: Noise, k: int) -> Noise:
     return Noise.unchecked(*(box[k:] if len(box.shape) == 2 else box for box in (noise.w, noise.v)))
 
 
-def _as_estimate(observer: Observer, out: StepOutput) -> Estimate:
+def _as_estimate(observer: AnyObserver, out: StepOutput) -> Estimate:
     return Estimate(
         out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows
     )
@@ -225,13 +234,21 @@ def _hold(call: str, on_conflict: str) -> bool:
     return on_conflict == "hold"
 
 
+def _check_length(length: Any, rows: int) -> None:
+    if np.ndim(length) or not jnp.issubdtype(jnp.result_type(length), jnp.integer):
+        raise ValueError(f"estimate: `length` must be one integer per record, got {length!r}; for many use jax.vmap")
+    if is_concrete(length) and not 0 <= int(length) <= rows:
+        raise ValueError(f"estimate: `length` must be between 0 and the {rows} rows of `y`, got {int(length)}")
+
+
 def _prepare(
-    call: str, observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise | None, rows: bool
-) -> tuple[Interval, Any, Any, Noise, Observer]:
+    call: str, observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise | None, rows: bool
+) -> tuple[Interval, Any, Any, Noise, AnyObserver]:
     """Check shapes (and values of concrete arrays), and bring everything to one dtype, bounds rounded outward."""
     system = observer.system
     lead = "(T, " if rows else "("
-    y = y if isinstance(y, jax.Array) else np.asarray(y, dtype=np.float64)
+    if not (isinstance(y, jax.Array | np.ndarray) and jnp.issubdtype(y.dtype, jnp.floating)):
+        y = np.asarray(y, dtype=np.float64) if not isinstance(y, jax.Array) else y.astype(float)
     if not isinstance(initial, Interval) or initial.shape != (system.n,):
         raise ValueError(
             f"{call}: `initial` must be an Interval of shape ({system.n},), got {getattr(initial, 'shape', initial)}; "

@@ -253,6 +253,17 @@ def add(*boxes: Interval) -> Interval:
     return Interval.unchecked(sum(box.lower for box in boxes), sum(box.upper for box in boxes))
 
 
+def entire_like(box: Any) -> Interval:
+    """All of R^n, in the shape and type of a box or an array."""
+    like = box.lower if isinstance(box, Interval) else box
+    return Interval.unchecked(jnp.full_like(like, -jnp.inf), jnp.full_like(like, jnp.inf))
+
+
+def choose(mask: Any, a: Interval, b: Interval) -> Interval:
+    """Elementwise `a` where the mask holds, else `b`."""
+    return Interval.unchecked(jnp.where(mask, a.lower, b.lower), jnp.where(mask, a.upper, b.upper))
+
+
 def hull(a: Interval, b: Interval) -> Interval:
     """The smallest box that contains both boxes, elementwise."""
     return Interval.unchecked(jnp.minimum(a.lower, b.lower), jnp.maximum(a.upper, b.upper))

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Iterable
+from typing import Any
+
+import jax.numpy as jnp
 
 
 class Status(enum.IntFlag):
@@ -19,6 +23,11 @@ class Status(enum.IntFlag):
     CROSSED = 16  # prediction form only: the printed recursion lost its order
 
 
+def bit_mask(bits: Iterable[tuple[Any, Status]]) -> Any:
+    """Join conditions and the bits they stand for into one integer array."""
+    return sum(jnp.where(condition, int(bit), 0).astype(jnp.int32) for condition, bit in bits)
+
+
 class Source(enum.IntEnum):
     """Which intersection was the tightest one of a step. The code in a result is ``kind * SOURCE_STRIDE + index``."""
 
@@ -29,6 +38,7 @@ class Source(enum.IntEnum):
     DYNAMICS = 4  # x = f + B u + G d + w with the bounds of d, by state
     INPUT = 5  # bounds of the unknown input against each other, by input
     CERTIFICATE = 6  # the certified bound, by state
+    BALANCE = 7  # a combination of dynamics and outputs that is free of the unknown input, by circuit of [G; H]
 
 
 SOURCE_STRIDE = 1 << 16

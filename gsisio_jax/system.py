@@ -108,6 +108,10 @@ class System(eqx.Module):
         """``g(x)`` or ``g(x, u)``, whichever the user gave."""
         return self.g(x, u) if self.g_takes_u else self.g(x)
 
+    def maps(self, x: Any, u: Any) -> Any:
+        """f and g together, (n + l,)."""
+        return jnp.concatenate([self.dynamics(x, u), self.measurement(x, u)])
+
     def _check_map(self, name: str, function: Callable[..., Any], size: int) -> None:
         dtype = jnp.result_type(float)
         x, u = jax.ShapeDtypeStruct((self.n,), dtype), jax.ShapeDtypeStruct((self.m,), dtype)

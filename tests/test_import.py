@@ -11,11 +11,11 @@ import gsisio_jax
 
 PACKAGE = Path(gsisio_jax.__file__).parent
 # Everything `estimate`, `start` and `step` may run through.
-ONLINE = sorted(
-    [PACKAGE / f"{name}.py" for name in ("interval", "system", "status", "contraction", "observer", "estimation")]
-    + [PACKAGE / f"{name}.py" for name in ("certificate", "alarms", "errors")]
-    + list((PACKAGE / "inclusion").glob("*.py"))
-)
+ONLINE_NAMES = (
+    "interval", "system", "status", "contraction", "observer", "recursion", "prediction", "estimation", "certificate",
+    "alarms", "errors",
+)  # fmt: skip
+ONLINE = sorted([PACKAGE / f"{name}.py" for name in ONLINE_NAMES] + list((PACKAGE / "inclusion").glob("*.py")))
 
 
 def _fresh(code: str) -> str:

@@ -21,6 +21,7 @@ examples:
   gsisio estimate flight                     a built-in example; files go to results/flight
   gsisio estimate pump.toml --out today      your own system and table
   gsisio design pump.toml                    what the observer promises, without any data
+  gsisio reproduce                           the paper's example; files go to results/paper
 
 CONFIG is a TOML file. It names the system ("module:attribute", also a module beside the file), the
 noise bounds, the region, the initial box, the table of measurements (CSV or Parquet) and the outputs.
@@ -90,6 +91,14 @@ def _parser() -> argparse.ArgumentParser:
 
     design = commands.add_parser("design", parents=[common], help="print the certificate alone", **layout)
     design.set_defaults(command=_design)
+
+    reproduce = commands.add_parser(
+        "reproduce", help="the paper's example: every printed number beside the computed one, figures 2 and 3", **layout
+    )
+    reproduce.add_argument("--out", metavar="DIR", type=Path, help="folder of the files (default: results/paper)")
+    reproduce.add_argument("--progress", choices=("auto", "always", "never"), default="auto", help="progress bar")
+    reproduce.add_argument("--debug", action="store_true", help="show the full traceback of every error")
+    reproduce.set_defaults(command=_reproduce)
     return parser
 
 
@@ -167,6 +176,13 @@ def _design(options: argparse.Namespace) -> int:
             print(f"  {kind} {index + 1} is {name}{f' [{unit}]' if unit else ''}")
     print(certificate)
     return 0
+
+
+def _reproduce(options: argparse.Namespace) -> int:
+    from .reproduce import reproduce
+
+    _use_float64()
+    return reproduce(options.out, options.progress)
 
 
 def _configuration(name: str) -> tuple[Path, Config]:

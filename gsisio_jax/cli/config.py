@@ -136,7 +136,11 @@ class DesignPart(_Part):
 
     gains: Annotated[int, Field(ge=1)] | None = None
     missing: bool | None = None
+    sweeps: Annotated[int, Field(ge=1)] | None = None
+    bounds: Annotated[list[str], Field(min_length=1)] | None = None
     form: Literal["current", "prediction"] | None = None
+    left_inverse: Literal["pseudo", "feedthrough", "smallest"] | None = None
+    allow_uncertified: bool | None = None
 
 
 class TablePart(_Part):

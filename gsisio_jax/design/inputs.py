@@ -9,22 +9,39 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import product
+from typing import NamedTuple
 
 import cvxpy as cp
 import numpy as np
 
 from gsisio_jax.contraction import Bank
 from gsisio_jax.design.gains import solve
+from gsisio_jax.design.left_inverse import basic_left_inverses, circuits
 from gsisio_jax.design.problem import GainProblem, without_rounding
+from gsisio_jax.observer import ExactInputs
+
+MOST_SUPPORTS = 500  # basic left inverses per group of inputs that share rows; each costs time in every step
 
 
-def input_bank(problem: GainProblem, width: np.ndarray) -> Bank:
-    """Left inverses as a `Bank` of bounds of d[k-1]; the first is of [G; H] and carries the certificate.
+class InputBounds(NamedTuple):
+    """Everything that bounds d[k-1]: the joint bounds, the exact ones for a box of [G; H] d, and a note on these."""
+
+    inverses: Bank
+    exact: ExactInputs
+    note: str
+
+
+def input_bounds(problem: GainProblem, width: np.ndarray) -> InputBounds:
+    """The bounds of the unknown input; the first of the joint ones is of [G; H] and carries the certificate.
 
     Args:
         problem: the gain problem.
         width: typical width of the state boxes, (n,).
     """
+    return InputBounds(_joint(problem, width), *_exact(problem, width))
+
+
+def _joint(problem: GainProblem, width: np.ndarray) -> Bank:
     n, l, q, p = problem.n, problem.l, problem.q, problem.G.shape[1]
     s = problem.columns - l - q
     direct, lifted = [], []
@@ -45,6 +62,25 @@ def input_bank(problem: GainProblem, width: np.ndarray) -> Bank:
         residual = -np.concatenate([without_rounding(L[:, l:] @ problem.C), L_y], axis=1)
         rows.append((residual, without_rounding(L_z @ problem.T2), L_z, L_s, known, np.zeros((p, n))))
     return Bank(*(np.stack(parts) for parts in zip(*rows, strict=True)))
+
+
+def _exact(problem: GainProblem, width: np.ndarray) -> tuple[ExactInputs, str]:
+    """All basic left inverses of [G; H] and its circuits, or the best of them where there are too many, and a note."""
+    stacked = np.vstack([problem.G, problem.H])
+    p, bounded = stacked.shape[1], ~problem.free
+    left = np.concatenate([2 * width + problem.dw, problem.dv + np.abs(problem.E) @ width])
+    inverses = basic_left_inverses(stacked, problem.free, MOST_SUPPORTS, left)
+    rings = circuits(stacked, problem.free, MOST_SUPPORTS)
+    # A circuit of one row is a row that d does not enter: the step contracts with these anyway.
+    rows = rings.rows[(rings.rows != 0).sum(axis=1) > 1]
+    exact = ExactInputs(
+        rows=inverses.rows,
+        known=(np.eye(p) - inverses.rows @ stacked)[:, :, bounded],
+        circuits=rows,
+        circuits_known=-(rows @ stacked)[:, bounded],
+        complete=inverses.complete and rings.complete,
+    )
+    return exact, "" if exact.complete else "input boxes are not exact: " + (inverses.note or rings.note)
 
 
 def _direct(problem: GainProblem, width: np.ndarray, use_y: bool) -> np.ndarray | None:

@@ -16,7 +16,6 @@ from gsisio_jax.inclusion.node import (
     Form,
     Node,
     as_node,
-    choose,
     guard,
     is_known,
     is_node,
@@ -26,7 +25,7 @@ from gsisio_jax.inclusion.node import (
     slope_image,
     slope_of,
 )
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval import Interval, choose
 
 
 class AffineForm(eqx.Module):

@@ -16,8 +16,6 @@ from gsisio_jax.inclusion.node import (
     Node,
     as_node,
     best_form,
-    choose,
-    entire_like,
     is_node,
     join,
     meet,
@@ -30,7 +28,7 @@ from gsisio_jax.inclusion.node import (
     times,
 )
 from gsisio_jax.inclusion.univariate import apply, extremes
-from gsisio_jax.interval import Interval, is_concrete
+from gsisio_jax.interval import Interval, choose, entire_like, is_concrete
 
 
 def multiply(x: Any, y: Any) -> Node:

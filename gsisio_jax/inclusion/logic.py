@@ -21,8 +21,6 @@ from gsisio_jax.inclusion.node import (
     as_node,
     best_form,
     chain,
-    choose,
-    entire_like,
     is_node,
     jac_of,
     join,
@@ -33,7 +31,7 @@ from gsisio_jax.inclusion.node import (
     slope_of,
 )
 from gsisio_jax.inclusion.univariate import apply
-from gsisio_jax.interval import Interval, hull
+from gsisio_jax.interval import Interval, choose, entire_like, hull
 
 
 def step(outcome: Interval, inputs: Sequence[Any]) -> Node:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval import Interval, choose
 
 
 @jax.custom_jvp
@@ -78,15 +78,6 @@ class Node(eqx.Module):
 
 def is_node(value: Any) -> bool:
     return isinstance(value, Node)
-
-
-def entire_like(value: Any) -> Interval:
-    return Interval.unchecked(jnp.full_like(value, -jnp.inf), jnp.full_like(value, jnp.inf))
-
-
-def choose(mask: Any, a: Interval, b: Interval) -> Interval:
-    """Elementwise `a` where the mask holds, else `b`."""
-    return Interval.unchecked(jnp.where(mask, a.lower, b.lower), jnp.where(mask, a.upper, b.upper))
 
 
 def is_known(value: Any) -> bool:

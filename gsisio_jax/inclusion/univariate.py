@@ -24,8 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.node import Node, best_form, choose, entire_like, product, shift, stretch
-from gsisio_jax.interval import Interval
+from gsisio_jax.inclusion.node import Node, best_form, product, shift, stretch
+from gsisio_jax.interval import Interval, choose, entire_like
 
 INF = math.inf
 # Below this relative width a secant is mostly rounding; the tangent at the middle is as good there.

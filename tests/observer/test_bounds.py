@@ -251,6 +251,9 @@ Y, U, BOX = np.zeros((4, 2)), np.zeros((4, 2)), Interval.symmetric([1.0, 1.0])
         ((BOX, Y, np.full((4, 2), np.nan)), "`u` must be finite"),
         ((BOX, Y, U, gx.Noise(Interval.symmetric([1.0]), Interval.symmetric([1.0, 1.0]))), "noise bounds of `w`"),
         ((BOX, Y, U, None, "ignore"), "`on_conflict` must be"),
+        ((BOX, Y, U, None, "hold", 5), "`length` must be between 0 and the 4 rows"),
+        ((BOX, Y, U, None, "hold", [4, 2]), "for many use jax.vmap"),
+        ((BOX, Y, U, None, "hold", 2.5), "`length` must be one integer"),
     ],
 )
 def test_bad_arguments_of_estimate(known, arguments, words):

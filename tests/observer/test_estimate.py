@@ -13,7 +13,7 @@ import systems
 from oracles.numpy_program import numpy_function
 
 import gsisio_jax as gx
-from gsisio_jax.observer import advance, begin
+from gsisio_jax.recursion import advance, begin
 
 STEPS = 25
 NAN = np.nan
@@ -287,3 +287,16 @@ def test_float32_contains_the_float64_truth(single):
     assert np.asarray(est.state.contains(x)).all()
     assert np.asarray(est.input.contains(d)).all()
     assert not (np.asarray(est.status) & (gx.Status.CONFLICT | gx.Status.UNBOUNDED)).any()
+
+
+def test_a_float32_carry_goes_on_with_float64_data(small):
+    """What was rounded outward once stays valid: the run continues in the wider type."""
+    narrow = gx.Interval(*(np.float32(side) for side in (small.initial.lower, small.initial.upper)))
+    carry, _ = gx.start(small.observer, narrow, small.y[0].astype(np.float32))
+    assert carry.state.dtype == np.float32
+    stepped, out = gx.step(small.observer, carry, small.y[1])
+    resumed, rows = gx.estimation.resume(small.observer, carry, small.y[1:])
+    assert {leaf.dtype for leaf in jax.tree.leaves((stepped, resumed))} == {np.dtype(np.float64)}
+    np.testing.assert_allclose(rows.state.upper[0], out.state.upper, rtol=1e-12)
+    exact = gx.estimate(small.observer, small.initial, small.y)
+    np.testing.assert_allclose(rows.state.upper, exact.state.upper[1:], rtol=1e-5)

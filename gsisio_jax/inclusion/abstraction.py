@@ -1,0 +1,97 @@
+"""Affine abstraction (paper, Prop. 1): two planes that enclose f on a region, or two per cell of a mesh of it.
+
+Only the data type and its evaluation live here; the planes are made offline by `gsisio_jax.design.abstraction`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gsisio_jax.interval import Interval, entire_like
+
+
+class Abstraction(eqx.Module):
+    """Planes ``lower_slope x + lower_offset <= f(x) <= upper_slope x + upper_offset`` for x in `region`; a pytree.
+
+    For a mesh every array has one axis more, over the cells, in front; each cell has its own planes.
+
+    Attributes:
+        region: box (n,), or for a mesh the cells (cells, n), which tile a box; units [x].
+        lower_slope, upper_slope: shape (cells?, m, n), units [f]/[x].
+        lower_offset, upper_offset: shape (cells?, m), units [f].
+        theta: (cells?, m), optimum of the linear program, component by component: the planes' largest distance
+            before f was enclosed between the vertices. The paper's one number is `printed_theta`.
+        sigma: (cells?, m), what the smoothness class asks to add to either plane.
+        gap: (cells?, m), largest distance of the planes: at most ``theta + 2 sigma``, less where a tighter
+            enclosure was proved.
+        verified: "engine": the planes were proved by bounding f on sub-boxes; "sigma": by the smoothness class.
+
+    Source: paper, Prop. 1 and Cor. 1; design 5.
+    """
+
+    region: Interval
+    lower_slope: Float[Array, "*cells m n"]
+    upper_slope: Float[Array, "*cells m n"]
+    lower_offset: Float[Array, "*cells m"]
+    upper_offset: Float[Array, "*cells m"]
+    theta: Float[Array, "*cells m"]
+    sigma: Float[Array, "*cells m"]
+    gap: Float[Array, "*cells m"]
+    verified: str = eqx.field(static=True)
+
+    @property
+    def printed_theta(self) -> Any:
+        """The optimum of (eq:abstraction) as printed, one number for all components: the largest; shape (cells?)."""
+        return self.theta.max(-1)
+
+    def over(self, box: Interval) -> Interval:
+        """Bounds of f on a box inside the region, from the planes alone.
+
+        Args:
+            box: shape (n,), units [x].
+
+        Returns:
+            Box of shape (m,), units [f]: over each cell that the box touches, the planes' range on the common part;
+            of these the hull. ``(-inf, inf)`` if any part of the box lies outside the region.
+
+        Raises:
+            ValueError: the box has another shape.
+
+        Source: paper, Cor. 1 (the two bounds with a hat).
+        """
+        n = self.upper_slope.shape[-1]
+        if not isinstance(box, Interval) or box.shape != (n,):
+            got = f"a box of shape {box.shape}" if isinstance(box, Interval) else repr(box)
+            raise ValueError(f"Abstraction.over: an Interval of shape ({n},) is needed, got {got}")
+        low, high = jnp.reshape(self.region.lower, (-1, n)), jnp.reshape(self.region.upper, (-1, n))
+        # Written so that NaN ends up outside, and a box equal to the region keeps its whole gradient.
+        inside = ((box.lower >= low.min(0)) & (box.upper <= high.max(0))).all()
+        x_lower = jnp.where(box.lower >= low, box.lower, low)
+        x_upper = jnp.where(box.upper <= high, box.upper, high)
+        touched = (x_lower <= x_upper).all(-1)
+        lower = _minimum(self.lower_slope, x_lower, x_upper) + self.lower_offset
+        upper = -_minimum(-self.upper_slope, x_lower, x_upper) + self.upper_offset
+        # Every cell is looked at: a gather would need shapes that depend on the box.
+        lower = jnp.where(touched[:, None], jnp.reshape(lower, (-1, lower.shape[-1])), jnp.inf).min(0)
+        upper = jnp.where(touched[:, None], jnp.reshape(upper, (-1, upper.shape[-1])), -jnp.inf).max(0)
+        known = inside & touched.any()
+        nothing = entire_like(lower)
+        # Rounding: to nearest so far; this is the place to widen for the sums above.
+        bounds = Interval.unchecked(jnp.where(known, lower, nothing.lower), jnp.where(known, upper, nothing.upper))
+        return bounds.astype(box.dtype)
+
+    def astype(self, dtype: Any) -> Abstraction:
+        """The same planes in another floating type, rounded to nearest."""
+        dtype = jax.dtypes.canonicalize_dtype(dtype)
+        return jax.tree.map(lambda value: jnp.asarray(value, dtype), self)
+
+
+def _minimum(slope: Any, lower: Any, upper: Any) -> Any:
+    """``A^+ lower - A^- upper``: the least value of A x on boxes (cells, n), A of shape (cells?, m, n)."""
+    up = jnp.maximum(slope, 0)
+    return (up * lower[:, None, :] - (up - slope) * upper[:, None, :]).sum(-1)

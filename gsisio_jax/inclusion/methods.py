@@ -1,0 +1,120 @@
+"""The paper's Corollary 1: bounds of a function by any choice of methods, intersected.
+
+All methods are sound, so their intersection is; which of them are worth their time depends on the function. The default
+of the observer, affine and natural bounds met at every node, is usually the tightest for its cost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from gsisio_jax.inclusion.abstraction import Abstraction
+from gsisio_jax.inclusion.api import AffineForm, affine, jacobian, mean_value, natural
+from gsisio_jax.inclusion.decomposition import decomposition, remainder
+from gsisio_jax.interval import Interval, choose
+
+METHODS = ("affine", "natural", "decomposition", "remainder", "mean_value", "abstraction")
+DEFAULT = ("affine", "natural")
+
+
+def check_methods(call: str, methods: Sequence[str]) -> tuple[str, ...]:
+    """The methods in their standard order, each once.
+
+    Raises:
+        ValueError: none is given, or one is unknown.
+    """
+    given = (methods,) if isinstance(methods, str) else tuple(methods)
+    unknown = [name for name in given if name not in METHODS]
+    if unknown or not given:
+        raise ValueError(
+            f"{call}: `bounds` must name some of {', '.join(METHODS)}; got {unknown[0] if unknown else 'none'!r}"
+        )
+    return tuple(name for name in METHODS if name in given)
+
+
+def bound(
+    f: Callable[..., Any],
+    methods: Sequence[str] = DEFAULT,
+    abstraction: Abstraction | None = None,
+    derivative: Interval | None = None,
+) -> Callable[..., AffineForm]:
+    """Bounds of f by several methods, intersected: a function of a box (n,) and of f's further arguments.
+
+    Args:
+        f: takes an array (n,), then further arguments; returns an array of shape (r,).
+        methods: any of `METHODS`. "affine" and "natural" together meet at every operation of f, which is tighter than
+            the intersection of the two at the end.
+        abstraction: planes of ``lambda z: f(z[:n], z[n:])`` (of f itself where f takes x alone), for "abstraction".
+        derivative: box (r, n) that contains the derivative everywhere, for "decomposition" and "remainder"; None
+            encloses it on the box at hand, which is tighter.
+
+    Returns:
+        A function that returns an `AffineForm`: its range is the intersection of all ranges; its slope is that of the
+        affine form, else of the mean-value form, else zero.
+
+    Raises:
+        ValueError: a method is unknown, or "abstraction" is asked for and none is given.
+
+    Source: paper, Corollary 1; design 5.
+    """
+    chosen = check_methods("inclusion.bound", methods)
+    if "abstraction" in chosen and abstraction is None:
+        raise ValueError('inclusion.bound: the method "abstraction" needs an `Abstraction`; give `abstraction`')
+
+    ranges_of = {
+        "natural": natural(f),
+        "decomposition": decomposition(f, derivative),
+        "remainder": remainder(f, derivative),
+        "mean_value": mean_value(f),
+    }
+
+    def bounds(box: Interval, *args: Any) -> AffineForm:
+        form, ranges = None, []
+        if "affine" in chosen:
+            form = affine(f)(box, *args)
+            ranges.append(form.range if "natural" in chosen else form.over(box))
+        ranges += [ranges_of[m](box, *args) for m in chosen if m in ranges_of and not (m == "natural" and form)]
+        if form is None and "mean_value" in chosen:
+            form = _mean_value_form(f, box, *args)
+        if abstraction is not None and "abstraction" in chosen:
+            takes_x_alone = abstraction.region.shape[-1] == box.shape[0]
+            ranges.append(abstraction.over(box if takes_x_alone else _with_arguments(box, args)))
+        met = ranges[0]
+        for other in ranges[1:]:
+            met = _meet(met, other)
+        if form is None:
+            slope = jnp.zeros((*met.lower.shape, *box.lower.shape), met.lower.dtype)
+            return AffineForm(slope, met, met)
+        return AffineForm(form.slope, form.offset, met)
+
+    return bounds
+
+
+def _meet(a: Interval, b: Interval) -> Interval:
+    """Intersection of two bounds of the same values; where rounding makes them miss each other, the first."""
+    lower, upper = jnp.maximum(a.lower, b.lower), jnp.minimum(a.upper, b.upper)
+    return choose(lower <= upper, Interval.unchecked(lower, upper), a)
+
+
+def _mean_value_form(f: Callable[..., Any], box: Interval, *args: Any) -> AffineForm:
+    """``f(c) + J (x - c)`` as an affine form: the middle of J is the slope, its radius the offset."""
+    enclosure, center = jacobian(f)(box, *args), box.center
+    finite = jnp.isfinite(enclosure.lower) & jnp.isfinite(enclosure.upper)
+    slope = jnp.where(finite, enclosure.center, 0)
+    around = Interval.unchecked(box.lower - center, box.upper - center)
+    radius = jnp.where(finite, enclosure.radius, jnp.inf)
+    reach = jnp.maximum(-around.lower, around.upper)
+    spread = jnp.where(reach == 0, 0, jnp.where(radius == 0, 0, radius * reach)).sum(-1)
+    at_center = natural(f)(Interval.unchecked(center, center), *args)
+    middle = Interval.unchecked(at_center.lower - slope @ center, at_center.upper - slope @ center)
+    offset = Interval.unchecked(middle.lower - spread, middle.upper + spread)
+    return AffineForm(slope, offset, offset)
+
+
+def _with_arguments(box: Interval, args: Sequence[Any]) -> Interval:
+    """The box of (x, u): known arguments are points."""
+    values = [jnp.asarray(arg, box.dtype) for arg in args]
+    return Interval.unchecked(jnp.concatenate([box.lower, *values]), jnp.concatenate([box.upper, *values]))

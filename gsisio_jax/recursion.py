@@ -1,0 +1,289 @@
+"""The recursion of the current form, one step at a time (design 4.3).
+
+`begin` takes the box of x[0] and the first measurement, `advance` takes one measurement more. `estimation.estimate` is
+nothing but these two in a `lax.scan`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gsisio_jax import inclusion
+from gsisio_jax.contraction import Bank, Evidence, Terms, centred, magnitude, solve_remainder, strips
+from gsisio_jax.inclusion import AffineForm
+from gsisio_jax.inclusion.methods import bound
+from gsisio_jax.interval import Interval, add, choose, entire_like, image, intersect, scale
+from gsisio_jax.observer import Carry, Observer, StepOutput
+from gsisio_jax.status import Source, Status, bit_mask
+from gsisio_jax.system import Noise, System
+
+
+def begin(
+    observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool = False
+) -> tuple[Carry, StepOutput]:
+    """Step 0: the initial box met with the state bounds and with y[0]. Arrays must have their final dtype."""
+    bounds = observer.system.state_bounds
+    z = image(observer.T2, output_box(observer.system, y, u, noise.v))
+    scale = magnitude(y, initial.lower, initial.upper)
+    evidence = prior = Evidence(bounds, scale).meet(initial[None], Source.INITIAL)
+    form = _first_form(observer, u)  # valid on every smaller box: the first sweep serves the fallback too
+    fallback = prior if hold else strips(Evidence(bounds, scale), form, z)
+    for sweep in range(observer.sweeps):
+        form = form if sweep == 0 else _free_output(observer, evidence.box, u)
+        evidence = strips(evidence, form, z)
+    return _finish(observer, evidence, fallback, None, None, y, u, noise, hold)
+
+
+def advance(
+    observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool = False
+) -> tuple[Carry, StepOutput]:
+    """One step of design 4.3, from the box of x[k-1] to that of x[k]. Arrays must have their final dtype.
+
+    After a conflict the recursion goes on from a box that does not contain the contradiction: y[k] and the state bounds
+    alone (restart), or the past alone, with y[k] taken as missing (`hold`).
+    """
+    evidence, fallback, d = _contract(observer, carry, y, u, noise)
+    if hold:
+        fallback, _, _ = _contract(observer, carry, jnp.full_like(y, jnp.nan), u, noise)
+    return _finish(observer, evidence, fallback, carry, d, y, u, noise, hold)
+
+
+def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[Evidence, Evidence, Interval]:
+    """Steps 1-6: the box of x[k], the box that y[k] and the state bounds alone give, and the box of d[k-1]."""
+    system, gains, inverses = observer.system, observer.gains, observer.inverses
+    before, bounds = carry.state, system.state_bounds
+    n = system.n
+
+    # What is known beforehand, as boxes: everything of identity (*) but h(x[k-1]) and psi(x[k]).
+    output = output_box(system, y, u, noise.v)
+    drift = add(_point(system.B @ carry.u), carry.noise.w)
+    seen = output_box(system, carry.y, carry.u, carry.noise.v)
+    shift = Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
+    terms = Terms(
+        shift, output, image(observer.bounded_states, bounds), image(observer.bounded_inputs, system.input_bounds)
+    )
+
+    # 1. Bounds of h = [f; g] on the old box, once for all gains (the last step has left them). 2. The right side of (*)
+    # without psi, jointly.
+    h = carry.h
+    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), gains.flat(), inverses.flat())
+    bound = both.explicit(h, before, terms)[0]
+    right = Interval.unchecked(*(x[: gains.rows].reshape(-1, n) for x in (bound.lower, bound.upper)))
+    shape = inverses.residual.shape[:2]
+    d_fixed = Interval.unchecked(*(x[gains.rows :].reshape(shape) for x in (bound.lower, bound.upper)))
+    f_now = add(h.range[:n], drift)
+
+    # 3.-5. Contract from the state bounds; y[k] alone first, because a restart begins there.
+    z = image(observer.T2, output)
+    evidence = alone = Evidence(bounds, magnitude(y, carry.y, before.lower, before.upper))
+    form, affine = _first_form(observer, u), observer.first.affine_output
+    for sweep in range(observer.sweeps):
+        form = form if sweep == 0 or affine else _free_output(observer, evidence.box, u)
+        evidence = strips(evidence, form, z)
+        if sweep == 0:
+            alone = evidence
+            evidence = _meet_closed_form(observer, evidence, right, u)
+        solved = right if affine else solve_remainder(gains, right, form, observer.C)
+        evidence = evidence.meet(solved, Source.STATE)
+    if system.p:
+        # The paper's own loop x = f + B u + G d + w: no way to a first box, but a contraction of a correct one.
+        d, _ = _inputs(observer, evidence, d_fixed, form)
+        evidence = evidence.meet(add(f_now, image(system.G, d))[None], Source.DYNAMICS)
+
+    # 6. The certified bound, where both boxes lie in the region. (The form of the last sweep holds on smaller boxes.)
+    evidence, promised = _certified(observer, evidence, before, right, terms, carry.u, u)
+    d, evidence = _inputs(observer, evidence, d_fixed, form)
+    d, evidence = _certified_input(observer, evidence, promised, d)
+    d, evidence = _exact_input(observer, evidence, add(h.range, shift), terms, d)
+    return evidence, alone, d
+
+
+def _meet_closed_form(observer: Observer, evidence: Evidence, right: Interval, u: Any) -> Evidence:
+    """Bounds that need no box to begin with: the contraction |N_z| R < 1 on the state bounds."""
+    chosen = observer.first.gains
+    if not chosen:
+        return evidence
+    right, N_z = jax.tree.map(lambda x: jnp.stack([x[k] for k in chosen]), (right, observer.gains.remainder))
+    boxes = jax.vmap(centred, in_axes=(0, 0, 0, None, None))(
+        right, N_z, observer.first.inverses, _psi(observer, u), observer.system.state_bounds
+    )
+    return evidence.meet(choose(in_box(u, observer.u_region), boxes, entire_like(boxes)), Source.STATE)
+
+
+def _certified(
+    observer: Observer, evidence: Evidence, before: Interval, right: Interval, terms: Terms, u_before: Any, u: Any
+) -> tuple[Evidence, _Promised]:
+    """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""
+    certificate, region = observer.certificate, observer.certificate.region
+    applies = jnp.asarray(False)
+    if certificate.promised:
+        applies = inside(before, region) & inside(evidence.box, region)
+        applies = applies & in_box(u_before, observer.u_region) & in_box(u, observer.u_region)
+    # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
+    c = jnp.where(applies, before.center, region.center)
+    promised = _Promised(applies, c, jnp.where(applies, before.radius, 0), u_before, terms)
+    if not certificate.promised:
+        return evidence, promised
+    gain = jax.tree.map(lambda x: x[0], observer.gains)
+    joint, slack = intersect(right[0], _around(observer, gain, certificate.growth, promised))
+    evidence = evidence.weigh(jnp.where(applies, slack, jnp.inf), Source.STATE)
+    safe = choose(applies, evidence.box, Interval.unchecked(c, c))
+    box = centred(joint, gain.remainder, observer.region_inverse, _psi(observer, u), safe)
+    return evidence.meet(choose(applies, box, entire_like(box))[None], Source.CERTIFICATE), promised
+
+
+def _certified_input(
+    observer: Observer, evidence: Evidence, promised: _Promised, d: Interval
+) -> tuple[Interval, Evidence]:
+    """The same centred form for d[k-1] with the first left inverse."""
+    certificate = observer.certificate
+    if not certificate.promised or not observer.system.p:
+        return d, evidence
+    inverse = jax.tree.map(lambda x: x[0], observer.inverses)
+    around = _around(observer, inverse, certificate.input_state_before, promised)
+    box = add(image(inverse.state, evidence.box), around)
+    met, slack = intersect(d, choose(promised.applies, box, entire_like(box)))
+    return met, evidence.weigh(slack, Source.INPUT)
+
+
+class _Promised(NamedTuple):
+    """Where the promise of the certificate applies, and the old box there: centre and radius."""
+
+    applies: Any
+    center: Any
+    radius: Any
+    u_before: Any
+    terms: Terms
+
+
+def _around(observer: Observer, row: Bank, slope: Any, promised: _Promised) -> Interval:
+    """A linear bound without its terms in x[k]: its value at the centre of the old box, give or take ``slope radius``.
+
+    No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
+    """
+    middle = (row.residual * observer.system.maps(promised.center, promised.u_before)).sum(-1)
+    spread = scale(slope, promised.radius).sum(-1)
+    return add(Interval.unchecked(middle - spread, middle + spread), row.linear(promised.terms))
+
+
+def _inputs(observer: Observer, evidence: Evidence, fixed: Interval, form: AffineForm) -> tuple[Interval, Evidence]:
+    """Box of d[k-1] from every left inverse, given the box of x[k] (design 4.5)."""
+    inverses, box = observer.inverses, evidence.box
+    # state x[k] - remainder psi(x[k]) with psi = (S - C) x + [e], slopes combined before the box is applied.
+    slope = inverses.state - (inverses.remainder[..., None] * (form.slope - observer.C)).sum(-2)
+    now = add(image(slope, box), image(-inverses.remainder, form.offset), fixed)
+    d = Evidence(observer.system.input_bounds, evidence.scale).meet(now, Source.INPUT)
+    return d.box, evidence.weigh(d.slacks[0], Source.INPUT) if d.slacks else evidence
+
+
+def _exact_input(
+    observer: Observer, evidence: Evidence, known: Interval, terms: Terms, d: Interval
+) -> tuple[Interval, Evidence]:
+    """The exact box of d[k-1] for ``[G; H] d`` in a box, that of ``[x[k]; 0] - known`` (paper, Lemma 3; design 4.5)."""
+    exact, box = observer.exact, evidence.box
+    if not observer.system.p:
+        return d, evidence
+    zero = jnp.zeros(observer.system.l, box.dtype)
+    explained = Interval.unchecked(
+        jnp.concatenate([box.lower, zero]) - known.upper, jnp.concatenate([box.upper, zero]) - known.lower
+    )
+    rows = add(image(exact.rows, explained), image(exact.known, terms.known))
+    met = Evidence(d, evidence.scale).meet(rows, Source.INPUT)
+    evidence = evidence.weigh(met.slacks[0], Source.INPUT)
+    # Some d must reach the box at all: every combination of rows that is free of d contains 0.
+    balance = add(image(exact.circuits, explained), image(exact.circuits_known, terms.known))
+    return met.box, evidence.weigh(jnp.minimum(balance.upper, -balance.lower), Source.BALANCE)
+
+
+def _finish(
+    observer: Observer,
+    evidence: Evidence,
+    fallback: Evidence,
+    carry: Carry | None,
+    d: Interval | None,
+    y: Any,
+    u: Any,
+    noise: Noise,
+    hold: bool,
+) -> tuple[Carry, StepOutput]:
+    """Choose what to believe after a conflict, and report."""
+    system, certificate = observer.system, observer.certificate
+    conflict = evidence.conflict
+    # Even the fallback may contradict itself (y[k] against the state bounds): then only the state bounds are left.
+    restart = choose(fallback.conflict, system.state_bounds, fallback.box)
+    state = choose(conflict, restart, evidence.box)
+    believed = ~conflict if hold else ~conflict | ~fallback.conflict
+    y_kept = jnp.where(believed, y, jnp.nan)
+
+    d = system.input_bounds if d is None else choose(conflict, system.input_bounds, d)
+    h = bound(system.maps, observer.bounds, observer.abstraction)(state, u)
+    d_now = current_input(observer.current, h, state, output_box(system, y_kept, u, noise.v))
+
+    applies = in_box(u, observer.u_region)
+    if carry is not None:
+        applies = applies & in_box(carry.u, observer.u_region)
+    if certificate.region_matters:
+        applies = applies & inside(state, certificate.region)
+        if carry is not None:
+            applies = applies & inside(carry.state, certificate.region)
+    bits = (
+        (conflict, Status.CONFLICT),
+        (~jnp.isfinite(y).all(), Status.MISSING),
+        (~(jnp.isfinite(state.lower) & jnp.isfinite(state.upper)).all(), Status.UNBOUNDED),
+        (~applies, Status.OUTSIDE_REGION),
+    )
+    return Carry(state, h, y_kept, u, noise), StepOutput(state, d, d_now, bit_mask(bits), *evidence.tightest())
+
+
+def current_input(current: Any, h: AffineForm, state: Interval, output: Interval) -> Interval:
+    """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
+    n, weights = state.shape[0], -current
+    slope = (weights[..., None] * h.slope[n:]).sum(-2)
+    joint = add(image(slope, state), image(weights, h.offset[n:]))
+    return add(intersect(joint, image(weights, h.range[n:]))[0], image(current, output))
+
+
+def output_box(system: System, y: Any, u: Any, v: Interval) -> Interval:
+    """Box of ``y - D u - v``: of ``g(x) + H d``; all of R where y is NaN (or infinite: batches cannot refuse it)."""
+    missing = ~jnp.isfinite(y)
+    known = jnp.where(missing, 0, y) - system.D @ u
+    return Interval.unchecked(
+        jnp.where(missing, -jnp.inf, known - v.upper), jnp.where(missing, jnp.inf, known - v.lower)
+    )
+
+
+def _free_output(observer: Observer, box: Interval, u: Any) -> AffineForm:
+    """Bounds of T2 g on a box of x[k]."""
+    return bound(_free_map(observer), observer.bounds, observer.output_abstraction)(box, u)
+
+
+def _first_form(observer: Observer, u: Any) -> AffineForm:
+    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes."""
+    known = observer.first.form
+    return inclusion.affine(_free_map(observer))(observer.system.state_bounds, u) if known is None else known
+
+
+def _free_map(observer: Observer) -> Any:
+    return lambda x, u: observer.T2 @ observer.system.measurement(x, u)
+
+
+def _psi(observer: Observer, u: Any) -> Any:
+    """The remainder T2 g(x) - C x."""
+    return lambda x: observer.T2 @ observer.system.measurement(x, u) - observer.C @ x
+
+
+def _point(value: Any) -> Interval:
+    return Interval.unchecked(value, value)
+
+
+def inside(box: Interval, region: Interval) -> Any:
+    """Does the whole box lie in the region?"""
+    return ((region.lower <= box.lower) & (box.upper <= region.upper)).all()
+
+
+def in_box(point: Any, box: Interval) -> Any:
+    """For a known input: do the design's enclosures of the derivatives hold for it?"""
+    return inside(_point(point), box)
