@@ -14,13 +14,14 @@ from .._extras import need
 if TYPE_CHECKING:
     from ..paper.example import Row
     from ..paper.reproduce import Reproduction
+    from .progress import When
 
 DEFAULT_OUT = Path("results/paper")
 WIDTH = 100
 _HEADER = ("number", "printed", "computed", "agree", "why not")
 
 
-def reproduce(out: Path | None, progress: str) -> int:
+def reproduce(out: Path | None, progress: When = "auto") -> int:
     """Compute, write the files and print the table.
 
     Args:
@@ -43,7 +44,7 @@ def reproduce(out: Path | None, progress: str) -> int:
 
     out = DEFAULT_OUT if out is None else out
     check_writable(out, list(FILES))
-    with DelayedProgress("auto" if progress not in ("always", "never") else progress) as bar:
+    with DelayedProgress(progress) as bar:
         bar.stage("computing")
         found = compute()
         bar.stage("writing the files")
@@ -135,7 +136,7 @@ def _show_rich(found: Reproduction, files: Sequence[Path], stream: IO[str]) -> N
     console.print(Text(_title(), style="bold"))
     table = Table(box=box.SIMPLE_HEAD)
     for heading, side in zip(_HEADER, ("left", "right", "right", "right", "left"), strict=True):
-        table.add_column(heading, justify=side, no_wrap=True)
+        table.add_column(heading, justify=side, no_wrap=heading in ("number", "agree"))
     for line in _lines(found.rows):
         table.add_row(*map(Text, line), style="" if line[3] == "yes" else "red")
     console.print(table)

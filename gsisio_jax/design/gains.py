@@ -1,6 +1,6 @@
 """Gains by linear programming: the exactly optimal one, and the best one for a given box size.
 
-The only module that calls a solver. Nothing it returns is trusted: gains are projected back onto the equality they
+Nothing a solver returns is trusted: gains are projected back onto the equality they
 must satisfy, and `GainProblem` evaluates them anew in NumPy.
 """
 

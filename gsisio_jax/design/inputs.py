@@ -15,8 +15,8 @@ import cvxpy as cp
 import numpy as np
 
 from gsisio_jax.contraction import Bank
+from gsisio_jax.design.basic_inverses import basic_left_inverses, circuits
 from gsisio_jax.design.gains import solve
-from gsisio_jax.design.left_inverse import basic_left_inverses, circuits
 from gsisio_jax.design.problem import GainProblem, without_rounding
 from gsisio_jax.observer import ExactInputs
 

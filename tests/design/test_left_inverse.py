@@ -11,8 +11,9 @@ import pytest
 from oracles.input_hull import feasibility_slack, input_hull, program
 
 from gsisio_jax import Interval
+from gsisio_jax.design.basic_inverses import basic_left_inverses, circuits
 from gsisio_jax.design.framer import framer_gains
-from gsisio_jax.design.left_inverse import basic_left_inverses, circuits, smallest_radius_inverse
+from gsisio_jax.design.left_inverse import smallest_radius_inverse
 from gsisio_jax.examples import paper
 from gsisio_jax.interval import image
 
