@@ -14,8 +14,9 @@ from gsisio_jax.status import Status
 from gsisio_jax.system import Noise, Simulation, System, simulate
 
 if TYPE_CHECKING:
-    from gsisio_jax import dataset, examples, paper, plot
+    from gsisio_jax import dataset, examples, paper, plot, study
     from gsisio_jax.design import design_observer
+    from gsisio_jax.study import grid, sweep
 
 __version__ = "0.1.0"
 
@@ -40,6 +41,7 @@ __all__ = [
     "estimate",
     "estimation",
     "examples",
+    "grid",
     "hull",
     "inclusion",
     "intersect",
@@ -49,13 +51,24 @@ __all__ = [
     "simulate",
     "start",
     "step",
+    "study",
+    "sweep",
 ]
 
-_LAZY = {"design_observer": "gsisio_jax.design", "dataset": "", "examples": "", "paper": "", "plot": ""}
+_LAZY = {
+    "design_observer": "gsisio_jax.design",
+    "grid": "gsisio_jax.study",
+    "sweep": "gsisio_jax.study",
+    "dataset": "",
+    "examples": "",
+    "paper": "",
+    "plot": "",
+    "study": "",
+}
 
 
 def __getattr__(name: str) -> Any:
-    """Load on first use what an online run does not need: the solver, tables and pictures."""
+    """Load on first use what an online run does not need: the solver, studies, tables and pictures."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib

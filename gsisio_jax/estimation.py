@@ -91,7 +91,7 @@ def estimate(
     if length is not None:
         _check_length(length, y.shape[0])
         y = jnp.where((jnp.arange(y.shape[0]) < length)[:, None], y, jnp.nan)
-    return _estimate(observer, initial, y, u, noise, _hold("estimate", on_conflict))
+    return _estimate(observer, initial, y, u, noise, check_on_conflict("estimate", on_conflict))
 
 
 def start(
@@ -118,7 +118,7 @@ def start(
     Source: design 7.
     """
     initial, y0, u0, noise, observer = _prepare("start", observer, initial, y0, u0, noise, rows=False)
-    return _start(observer, initial, y0, u0, noise, _hold("start", on_conflict))
+    return _start(observer, initial, y0, u0, noise, check_on_conflict("start", on_conflict))
 
 
 def step(
@@ -146,7 +146,7 @@ def step(
     """
     box, y_k, u_k, noise, observer = _prepare("step", observer, carry.state, y_k, u_k, noise, rows=False)
     # A carry of lower precision is widened to that of the data; nothing is lost.
-    return _step(observer, cast(carry, box.dtype), y_k, u_k, noise, _hold("step", on_conflict))
+    return _step(observer, cast(carry, box.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))
 
 
 def resume(
@@ -163,7 +163,7 @@ def resume(
         The carry after the last row, and a `StepOutput` whose arrays have one row per row of `y`.
     """
     box, y, u, noise, observer = _prepare("resume", observer, carry.state, y, u, noise, rows=True)
-    return _resume(observer, cast(carry, box.dtype), y, u, noise, _hold("resume", on_conflict))
+    return _resume(observer, cast(carry, box.dtype), y, u, noise, check_on_conflict("resume", on_conflict))
 
 
 def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
@@ -174,19 +174,19 @@ def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
 
 @partial(jax.jit, static_argnames="hold")
 def _estimate(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Estimate:
-    carry, first = _recursion(observer).begin(observer, initial, y[0], u[0], _row(noise, 0), hold)
+    carry, first = recursion_of(observer).begin(observer, initial, y[0], u[0], noise_at(noise, 0), hold)
     _, rest = _scan(observer, carry, y[1:], u[1:], _rows_from(noise, 1), hold)
     return _as_estimate(observer, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest))
 
 
 @partial(jax.jit, static_argnames="hold")
 def _start(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
-    return _recursion(observer).begin(observer, initial, y, u, noise, hold)
+    return recursion_of(observer).begin(observer, initial, y, u, noise, hold)
 
 
 @partial(jax.jit, static_argnames="hold")
 def _step(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
-    return _recursion(observer).advance(observer, carry, y, u, noise, hold)
+    return recursion_of(observer).advance(observer, carry, y, u, noise, hold)
 
 
 @partial(jax.jit, static_argnames="hold")
@@ -204,17 +204,18 @@ def _scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hol
             noise.w if now.w is None else now.w,
             noise.v if now.v is None else now.v,
         )
-        return _recursion(observer).advance(observer, carry, y_k, u_k, bounds, hold)
+        return recursion_of(observer).advance(observer, carry, y_k, u_k, bounds, hold)
 
     return jax.lax.scan(body, carry, (y, u, varying))
 
 
-def _recursion(observer: AnyObserver) -> Any:
+def recursion_of(observer: AnyObserver) -> Any:
     """The module whose `begin` and `advance` belong to this kind of observer."""
     return prediction if isinstance(observer, PredictionObserver) else recursion
 
 
-def _row(noise: Noise, k: int) -> Noise:
+def noise_at(noise: Noise, k: int) -> Noise:
+    """Bounds of step k, where they change with time."""
     return Noise.unchecked(*(box[k] if len(box.shape) == 2 else box for box in (noise.w, noise.v)))
 
 
@@ -228,7 +229,8 @@ def _as_estimate(observer: AnyObserver, out: StepOutput) -> Estimate:
     )
 
 
-def _hold(call: str, on_conflict: str) -> bool:
+def check_on_conflict(call: str, on_conflict: str) -> bool:
+    """True for "hold"; refuses anything but "restart" and "hold"."""
     if on_conflict not in ("restart", "hold"):
         raise ValueError(f'{call}: `on_conflict` must be "restart" or "hold", got {on_conflict!r}')
     return on_conflict == "hold"
