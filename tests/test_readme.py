@@ -12,9 +12,12 @@ def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", README.read_text(), re.DOTALL)
 
 
-def test_the_python_example_runs():
-    (code,) = blocks("python")
-    exec(compile(code, str(README), "exec"), {})
+def test_the_python_examples_run():
+    """In order, as one session: the later ones go on with what the first one made."""
+    session: dict = {}
+    for code in blocks("python"):
+        exec(compile(code, str(README), "exec"), session)
+    assert dict(session["study"].sizes) == {"box": 50, "noise": 3, "state": 2, "input": 2}
 
 
 def test_links_and_pictures_exist():
