@@ -91,14 +91,18 @@ class Certificate(eqx.Module):
         return (width @ self.growth.T + self.noise_width(noise)) @ inverse.T
 
     def widths(self, noise: Noise) -> Any:
-        """Steady width (n,) for other noise bounds; all ``inf`` if the recursion does not contract."""
+        """Steady width (n,) or (..., n) for other noise bounds; all ``inf`` if the recursion does not contract."""
+        added = self.noise_width(noise)
         if not self.certified:
-            return np.full(len(self.growth), np.inf)
-        return np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit) @ self.noise_width(noise)
+            return np.full(np.shape(added), np.inf)
+        return added @ np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit).T
 
     def input_widths(self, noise: Noise) -> Any:
-        """Steady width (p,) of the input boxes for other noise bounds."""
-        return self.input_width_after(self.widths(noise), self.widths(noise), noise)
+        """Steady width (p,) or (..., p) of the input boxes for other noise bounds; ``inf`` as in `widths`."""
+        state = self.widths(noise)
+        if not self.certified:
+            return np.full((*np.shape(state)[:-1], len(self.input_width)), np.inf)
+        return self.input_width_after(state, state, noise)
 
     def input_width_after(self, now: Any, before: Any, noise: Noise) -> Any:
         """Width of the box of d[k-1] from the state widths at k and k-1, (p,) or a stack (..., p)."""

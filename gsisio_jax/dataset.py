@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ._extras import need
-from .status import Status
+from .status import flag_attributes
 
 
 def to_dataset(
@@ -80,7 +80,8 @@ def to_dataset(
         for index, (name, unit) in enumerate(zip(output_names, output_units, strict=True)):
             attributes = {"units": unit, "long_name": f"measured {_spoken(name)}", "role": "output"}
             variables[f"measured_{name}"] = ("time", y[:, index], attributes)
-    variables["status"] = ("time", np.asarray(est.status).astype(np.int32), _flags())
+    flags = {"long_name": "status of the step (0 = OK)", **flag_attributes()}
+    variables["status"] = ("time", np.asarray(est.status).astype(np.int32), flags)
     margin = {"long_name": "signed slack of the tightest intersection, in the unit of its component"}
     variables["margin"] = ("time", np.asarray(est.margin), margin)
     alarms = alarm_records(
@@ -158,12 +159,3 @@ def _add_bounds(
     for side, values in (("lower", lower), ("upper", upper)):
         attributes = {"units": unit, "long_name": f"{side} bound of {_spoken(name)}", "role": role, "signal": name}
         variables[f"{name}_{side}"] = ("time", values[:, index], attributes)
-
-
-def _flags() -> dict[str, Any]:
-    members = [member for member in Status if member.value]
-    return {
-        "long_name": "status of the step (0 = OK)",
-        "flag_masks": np.array([member.value for member in members], dtype=np.int32),
-        "flag_meanings": " ".join(str(member.name) for member in members),
-    }

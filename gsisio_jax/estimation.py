@@ -90,7 +90,7 @@ def estimate(
     initial, y, u, noise, observer = _prepare("estimate", observer, initial, y, u, noise, rows=True)
     if length is not None:
         _check_length(length, y.shape[0])
-        y = jnp.where((jnp.arange(y.shape[0]) < length)[:, None], y, jnp.nan)
+        y = cut(y, length)
     return _estimate(observer, initial, y, u, noise, check_on_conflict("estimate", on_conflict))
 
 
@@ -195,18 +195,11 @@ def _resume(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, h
 
 
 def _scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
-    """Bounds that change with time travel with the rows; constant ones stay outside the loop."""
-    varying = Noise.unchecked(*(box if len(box.shape) == 2 else None for box in (noise.w, noise.v)))
-
     def body(carry: Carry, row: Any) -> tuple[Carry, StepOutput]:
         y_k, u_k, now = row
-        bounds = Noise.unchecked(
-            noise.w if now.w is None else now.w,
-            noise.v if now.v is None else now.v,
-        )
-        return recursion_of(observer).advance(observer, carry, y_k, u_k, bounds, hold)
+        return recursion_of(observer).advance(observer, carry, y_k, u_k, noise_of_row(noise, now), hold)
 
-    return jax.lax.scan(body, carry, (y, u, varying))
+    return jax.lax.scan(body, carry, (y, u, noise_rows(noise)))
 
 
 def recursion_of(observer: AnyObserver) -> Any:
@@ -217,6 +210,21 @@ def recursion_of(observer: AnyObserver) -> Any:
 def noise_at(noise: Noise, k: int) -> Noise:
     """Bounds of step k, where they change with time."""
     return Noise.unchecked(*(box[k] if len(box.shape) == 2 else box for box in (noise.w, noise.v)))
+
+
+def noise_rows(noise: Noise) -> Noise:
+    """Bounds that change with time travel with the rows of a scan; constant ones (None here) stay outside the loop."""
+    return Noise.unchecked(*(box if len(box.shape) == 2 else None for box in (noise.w, noise.v)))
+
+
+def noise_of_row(noise: Noise, row: Noise) -> Noise:
+    """Bounds of one step from a row of `noise_rows` and the constant ones."""
+    return Noise.unchecked(noise.w if row.w is None else row.w, noise.v if row.v is None else row.v)
+
+
+def cut(y: Any, length: Any) -> Any:
+    """A ragged record: rows behind `length` are missing."""
+    return jnp.where((jnp.arange(y.shape[0]) < length)[:, None], y, jnp.nan)
 
 
 def _rows_from(noise: Noise, k: int) -> Noise:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 
 class Status(enum.IntFlag):
@@ -26,6 +27,15 @@ class Status(enum.IntFlag):
 def bit_mask(bits: Iterable[tuple[Any, Status]]) -> Any:
     """Join conditions and the bits they stand for into one integer array."""
     return sum(jnp.where(condition, int(bit), 0).astype(jnp.int32) for condition, bit in bits)
+
+
+def flag_attributes() -> dict[str, Any]:
+    """What the bits mean, as attributes of a dataset's variable (CF conventions)."""
+    members = [member for member in Status if member.value]
+    return {
+        "flag_masks": np.array([member.value for member in members], dtype=np.int32),
+        "flag_meanings": " ".join(str(member.name) for member in members),
+    }
 
 
 class Source(enum.IntEnum):

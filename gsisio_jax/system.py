@@ -100,6 +100,11 @@ class System(eqx.Module):
         """Number of known inputs."""
         return self.B.shape[1]
 
+    @property
+    def takes_u(self) -> bool:
+        """f or g takes the known input, so enclosures of their derivatives depend on it."""
+        return self.f_takes_u or self.g_takes_u
+
     def dynamics(self, x: Any, u: Any) -> Any:
         """``f(x)`` or ``f(x, u)``, whichever the user gave."""
         return self.f(x, u) if self.f_takes_u else self.f(x)

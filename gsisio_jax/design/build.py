@@ -172,7 +172,7 @@ def _check(
             f'design_observer: `region` must be an Interval of shape ({system.n},) or "auto", got {region!r}'
         )
     if u_region is None:
-        if system.f_takes_u or system.g_takes_u:
+        if system.takes_u:
             raise ValueError(
                 "design_observer: f or g takes u; give `u_region`, the box of known inputs for which the design holds"
             )

@@ -37,6 +37,11 @@ class Feedthrough:
     current: np.ndarray
     note: str
 
+    @property
+    def output_rows(self) -> tuple[tuple[int, ...], ...]:
+        """For every row of T2 the outputs that enter it."""
+        return tuple(tuple(int(j) for j in np.flatnonzero(row)) for row in self.T2)
+
 
 def factorise(H: np.ndarray) -> Feedthrough:
     """Factorise the feedthrough matrix, shape (l, p), any rank."""

@@ -26,6 +26,7 @@ class FramerGains(NamedTuple):
         M_f, M_g, M_y, M_u, M_v, M_w: ``pinv(A_x) A_s``.
         N11, N12, N21, N22: of (eq:dup): J^+, -J^-, -J^-, J^+.
         rho: spectral radius of ``|G||J1|``; the recursion is a framer for all data only if it is below 1 (P3).
+        guaranteed: it is, by a margin, and a nonnegative inverse of ``I - |G||J1|`` confirms it.
 
     Source: paper, Theorem 1 and Lemma 3; design 3.
     """
@@ -57,6 +58,7 @@ class FramerGains(NamedTuple):
     N21: Any
     N22: Any
     rho: float
+    guaranteed: bool
 
 
 def framer_gains(system: System, left_inverse: Any = None) -> FramerGains:
@@ -96,10 +98,19 @@ def framer_gains(system: System, left_inverse: Any = None) -> FramerGains:
     # A_x is exactly singular for a rank-deficient H: do not invert what rounding left of its zero.
     solve = np.linalg.pinv(A_x, rcond=1e-10)
     M_f, M_g, M_y, M_u = (solve @ matrix for matrix in (A_f, A_g, A_y, A_u))
+    rho = spectral_radius(np.abs(G) @ np.abs(J[:, :n]))
     return FramerGains(
         J, J[:, :n], J[:, n:], K, L, K1, K2, L1, L2,
         A_x, A_f, A_g, A_y, A_u, A_g, A_f,
         M_f, M_g, M_y, M_u, M_g, M_f,
         J_up, -J_down, -J_down, J_up,
-        spectral_radius(np.abs(G) @ np.abs(J[:, :n])),
+        rho, _is_framer(G, H, J[:, :n], rho),
     )  # fmt: skip
+
+
+def _is_framer(G: np.ndarray, H: np.ndarray, J1: np.ndarray, rho: float) -> bool:
+    """rho < 1, by a margin; for a rank-deficient H it is at least 1, whatever rounding says (P3)."""
+    if np.linalg.matrix_rank(H) < G.shape[1] or not rho < 1 - 1e-9:
+        return False
+    inverse = np.linalg.inv(np.eye(len(G)) - np.abs(G) @ np.abs(J1))
+    return bool(inverse.min() >= -1e-12 * np.abs(inverse).max())

@@ -18,7 +18,7 @@ def plane_bounds(
 ) -> Abstraction:
     """Planes of ``function(x, u)`` over region x u_region (over the region alone where it does not take u)."""
     n = system.n
-    if not (system.f_takes_u or system.g_takes_u):
+    if not system.takes_u:
         return affine_abstraction(lambda x: function(x, jnp.zeros(system.m, x.dtype)), region)
     both = Interval(
         *(jnp.concatenate([a, b]) for a, b in ((region.lower, u_region.lower), (region.upper, u_region.upper)))

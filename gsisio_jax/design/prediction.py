@@ -8,7 +8,7 @@ import numpy as np
 
 from gsisio_jax import inclusion
 from gsisio_jax.certificate import Certificate, spectral_radius
-from gsisio_jax.design.feedthrough import Feedthrough, factorise
+from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.framer import FramerGains, framer_gains
 from gsisio_jax.design.left_inverse import smallest_radius_inverse
 from gsisio_jax.design.planes import plane_bounds
@@ -48,8 +48,7 @@ def design_prediction(
         )
     feedthrough = factorise(np.asarray(system.H))
     gains = framer_gains(system, _choose(system, left_inverse))
-    guaranteed = _is_framer(system, gains)
-    if not guaranteed and not allow_uncertified:
+    if not gains.guaranteed and not allow_uncertified:
         raise FramerNotGuaranteed(_reason(system, gains, left_inverse))
 
     def promise(box: Interval) -> Certificate:
@@ -68,20 +67,15 @@ def design_prediction(
         state_gain=np.hstack([gains.M_f, gains.M_g, gains.M_w, gains.M_v, gains.M_y, gains.M_u]),
         input_gain=np.block([[gains.N11, gains.N12], [gains.N21, gains.N22]]),
         rho=np.float64(gains.rho),
-        u_region=u_region if system.f_takes_u or system.g_takes_u else Interval.entire(system.m),
+        u_region=u_region if system.takes_u else Interval.entire(system.m),
         abstraction=abstraction,
         derivative=derivative,
         current=feedthrough.current,
         current_input_directions=feedthrough.V1,
-        guaranteed=guaranteed,
+        guaranteed=gains.guaranteed,
         bounds=bounds,
-        output_rows=_rows(feedthrough),
+        output_rows=feedthrough.output_rows,
     )
-
-
-def _is_framer(system: System, gains: FramerGains) -> bool:
-    """rho < 1, by a margin; for a rank-deficient H it is at least 1, whatever rounding says (P3)."""
-    return bool(np.linalg.matrix_rank(np.asarray(system.H)) == system.p and gains.rho < 1 - 1e-9)
 
 
 def _choose(system: System, left_inverse: LeftInverse | Any) -> Any:
@@ -150,8 +144,7 @@ def _certificate(
     eye, W_f, W_g = np.eye(n), gain[:n], gain[n:]
     finite = bool(np.isfinite(gain).all())
     growth = (eye + G1) @ W_f + G2 @ W_g if finite else np.full((n, n), np.inf)
-    framer = _is_framer(system, gains)
-    certified = finite and framer and spectral_radius(np.linalg.solve(eye - G1, growth)) < 1
+    certified = finite and gains.guaranteed and spectral_radius(np.linalg.solve(eye - G1, growth)) < 1
     dw, dv = (np.asarray(box.width, dtype=np.float64) for box in (noise.w, noise.v))
     steady = np.linalg.solve(eye - G1 - growth, (eye + G1) @ dw + G2 @ dv) if certified else np.full(n, np.inf)
     before = np.abs(gains.J1) @ W_f + np.abs(gains.J2) @ W_g if finite else np.full((system.p, n), np.inf)
@@ -178,9 +171,5 @@ def _certificate(
         promised=certified,
         recoverable=None,
         notes=(f"prediction form, rho(|G||J1|) = {gains.rho:.4g}",),
-        framer=framer,
+        framer=gains.guaranteed,
     )
-
-
-def _rows(feedthrough: Feedthrough) -> tuple[tuple[int, ...], ...]:
-    return tuple(tuple(int(j) for j in np.flatnonzero(row)) for row in feedthrough.T2)

@@ -166,7 +166,7 @@ def check_region(call: str, system: System, region: Interval, u_region: Interval
     if region.shape != (system.n,):
         raise ValueError(f"{call}: `region` must have shape ({system.n},), got {region.shape}")
     if u_region is None:
-        if system.f_takes_u or system.g_takes_u:
+        if system.takes_u:
             raise ValueError(f"{call}: f or g takes u; give `u_region`, the box of known inputs")
         return Interval(np.zeros(system.m), np.zeros(system.m))
     if u_region.shape != (system.m,):

@@ -17,7 +17,6 @@ from gsisio_jax import estimation
 from gsisio_jax.estimation import AnyObserver
 from gsisio_jax.study.axes import bare
 from gsisio_jax.study.reduce import Context, Kept, Reduction
-from gsisio_jax.system import Noise
 
 TARGET_BYTES = 256 * 2**20  # working set of a tile
 # What XLA holds for a step, in sizes of what the scan carries: 6.1 for two states with sines, 3.7 for four with roots
@@ -59,18 +58,15 @@ def _run(observer: AnyObserver, varying: Any, shared: Any, reductions: tuple[Red
 def _case(observer: AnyObserver, case: Any, reductions: tuple[Reduction, ...], hold: bool) -> dict[str, Any]:
     y, u, noise, length = case["y"], case["u"], case["noise"], case["length"]
     if length is not None:
-        y = jnp.where((jnp.arange(y.shape[0]) < length)[:, None], y, jnp.nan)
+        y = estimation.cut(y, length)
     begin, advance = (getattr(estimation.recursion_of(observer), name) for name in ("begin", "advance"))
     carry, first = begin(observer, case["initial"], y[0], u[0], estimation.noise_at(noise, 0), hold)
     states = _first(reductions, first, _context(case))
-    # Bounds that change with time travel with the rows; constant ones stay outside the loop.
-    by_time = Noise.unchecked(*(box if len(box.shape) == 2 else None for box in (noise.w, noise.v)))
 
     def body(state: Any, row: Any) -> tuple[Any, Any]:
         carry, states = state
         k, y_k, u_k, now, x, d = row
-        bounds = Noise.unchecked(noise.w if now.w is None else now.w, noise.v if now.v is None else now.v)
-        carry, out = advance(observer, carry, y_k, u_k, bounds, hold)
+        carry, out = advance(observer, carry, y_k, u_k, estimation.noise_of_row(noise, now), hold)
         context = Context(case["steady"], x, d)
         after, kept = [], []
         for reduction, before in zip(reductions, states, strict=True):
@@ -89,7 +85,8 @@ def _case(observer: AnyObserver, case: Any, reductions: tuple[Reduction, ...], h
     running = [None if isinstance(r, Kept) else state for r, state in zip(reductions, states, strict=True)]
     x, d = case["truth"] if case["truth"] is not None else (None, None)
     rows = (
-        jnp.arange(1, y.shape[0], dtype=jnp.int32), y[1:], u[1:], jax.tree.map(lambda a: a[1:], by_time),
+        jnp.arange(1, y.shape[0], dtype=jnp.int32), y[1:], u[1:],
+        jax.tree.map(lambda a: a[1:], estimation.noise_rows(noise)),
         None if x is None else x[1 : y.shape[0]], None if d is None else d[: y.shape[0] - 1],
     )  # fmt: skip
     (_, running), kept = jax.lax.scan(body, (carry, running), rows)

@@ -15,7 +15,7 @@ from gsisio_jax import estimation
 from gsisio_jax._extras import need
 from gsisio_jax.estimation import AnyObserver, OnConflict
 from gsisio_jax.interval import Interval
-from gsisio_jax.status import Status
+from gsisio_jax.status import flag_attributes
 from gsisio_jax.study.axes import Axis, Layout, bare, prepare
 from gsisio_jax.study.kernel import fingerprint, outline, run_cases, tile_size
 from gsisio_jax.study.reduce import Reduction, Variable
@@ -252,7 +252,7 @@ def _variables(
         shape = shapes[name]
         own = tuple(f"{name}_dim{i}" for i in range(len(shape.shape)))
         dims, text, unit = described.get(name, Variable(own, name))
-        about: dict[str, Any] = {"long_name": text, **(_flags() if unit == "status" else labels.unit(unit))}
+        about: dict[str, Any] = {"long_name": text, **(flag_attributes() if unit == "status" else labels.unit(unit))}
         variables[name] = tuple(shape.shape), np.dtype(shape.dtype).name, tuple(dims), about
     return variables
 
@@ -279,14 +279,6 @@ def _coordinates(
     return coordinates
 
 
-def _flags() -> dict[str, Any]:
-    members = [member for member in Status if member.value]
-    return {
-        "flag_masks": np.array([member.value for member in members], dtype=np.int32),
-        "flag_meanings": " ".join(str(member.name) for member in members),
-    }
-
-
 def _promises(observer: AnyObserver, noise: Any) -> tuple[np.ndarray, np.ndarray]:
     """Steady widths of states and inputs for the noise of a study: (n,) and (p,), or with the axis of the noise."""
     certificate, bounds = observer.certificate, bare(noise)
@@ -296,18 +288,7 @@ def _promises(observer: AnyObserver, noise: Any) -> tuple[np.ndarray, np.ndarray
     if not isinstance(noise, Axis) and all(np.ndim(box.lower) != 2 for box in (bounds.w, bounds.v)):
         widths = [width[0] if width.ndim == 2 and len(width) == 1 else width for width in widths]
     largest = Noise.unchecked(*(Interval.unchecked(-0.5 * width, 0.5 * width) for width in widths))
-    # As `certificate.widths`, for all at once.
-    added = certificate.noise_width(largest)
-    if certificate.certified:
-        inverse = np.linalg.inv(np.eye(added.shape[-1]) - certificate.growth - certificate.implicit)
-        state = added @ inverse.T
-    else:
-        state = np.full_like(added, np.inf)
-    if not observer.system.p:
-        return state, np.zeros((*state.shape[:-1], 0))
-    if not certificate.certified:
-        return state, np.full((*state.shape[:-1], observer.system.p), np.inf)
-    return state, np.asarray(certificate.input_width_after(state, state, largest))
+    return np.asarray(certificate.widths(largest)), np.asarray(certificate.input_widths(largest))
 
 
 def _along(noise: Any, value: np.ndarray) -> Any:
