@@ -223,11 +223,11 @@ def strips(evidence: Evidence, form: AffineForm, z: Interval) -> Evidence:
 def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box: Interval) -> Interval:
     """Solve ``x + N_z psi(x) in right`` for x, for every gain.
 
-    On the box ``psi(x) = (S - C) x + [e]``, so ``A x in right - N_z [e]`` with ``A = I + N_z (S - C)``: one plain linear
-    solve, by the matrix inversion lemma with a q x q inverse. Where that inverse does not verify the contraction is
-    skipped. For any matrix M, ``x = M (A x) + (I - M A) x``: with ``D = S - C``, B the computed inverse of ``I + D N_z`` and
-    ``M = I - N_z B D``, ``I - M A = N_z (B (I + D N_z) - I) D``, which counts with the reach of the box, as does the
-    rounding of M and D.
+    On the box ``psi(x) = (S - C) x + [e]``, so ``A x in right - N_z [e]`` with ``A = I + N_z (S - C)``: one plain
+    linear solve, by the matrix inversion lemma with a q x q inverse. Where that inverse does not verify the
+    contraction is skipped. For any matrix M, ``x = M (A x) + (I - M A) x``: with ``D = S - C``, B the computed inverse
+    of ``I + D N_z`` and ``M = I - N_z B D``, ``I - M A = N_z (B (I + D N_z) - I) D``, which counts with the reach of
+    the box, as does the rounding of M and D.
 
     Args:
         gains: K gains.
@@ -272,8 +272,9 @@ def _product(a: Any, b: Any) -> Any:
 
 
 def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
-    """Inverse of a stack (K, q, q) of matrices near the identity, by elimination without LAPACK, what its product with
-    the matrix misses of the identity (magnitudes, as evaluated), and whether it verifies. A small pivot gives a wrong inverse, which the residual reveals; it is never trusted unverified."""
+    """Inverse of a stack (K, q, q) of matrices near the identity, by elimination without LAPACK, what its product
+    with the matrix misses of the identity (magnitudes, as evaluated), and whether it verifies. A small pivot gives a
+    wrong inverse, which the residual reveals; it is never trusted unverified."""
     q = matrix.shape[-1]
     identity = jnp.broadcast_to(jnp.eye(q, dtype=matrix.dtype), matrix.shape)
     work = jnp.concatenate([matrix, identity], axis=-1)
@@ -301,8 +302,8 @@ def centred(
     """Bound x by its distance from one point c, where ``x + N_z psi(x) in right`` and x lies in `within`.
 
     With ``mid +- rad = right``, ``c <- clip(mid - N_z psi(c))`` a few times and r the last move, ``|x - c| <=
-    (I - |N_z| R)^{-1} (rad + r)``. Clipping is nonexpansive, and keeps c where R bounds the derivative of psi. Any c will
-    do, so only the last move is evaluated with its rounding.
+    (I - |N_z| R)^{-1} (rad + r)``. Clipping is nonexpansive, and keeps c where R bounds the derivative of psi. Any c
+    will do, so only the last move is evaluated with its rounding.
 
     Args:
         right: box (n,).

@@ -88,7 +88,7 @@ def first_form(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64
 
 
 def contracting_gains(N_z: np.ndarray, Q: np.ndarray, C: Any, everywhere: Slopes) -> list[np.ndarray | None]:
-    """For each gain an upper inverse of ``I - |N_z| R - Q`` on the state bounds, or None where that does not contract."""
+    """For each gain an upper inverse of ``I - |N_z| R - Q`` on the state bounds, or None where there is none."""
     with np.errstate(invalid="ignore"):
         R = (np.abs(everywhere.Z - C) + everywhere.Z_radius) * _UP
     return [upper_inverse((_weighted(np.abs(weights), R) + left) * _UP) for weights, left in zip(N_z, Q, strict=True)]

@@ -117,10 +117,10 @@ class _Missed:
     def __init__(self, observer: Observer, d_fixed: Interval):
         guard, bounds = observer.guard, observer.system.input_bounds
         self.guard, self.limit = guard, reach(bounds)
-        known = [spread(V, reach(d_fixed[j])) for V, j in zip(guard.input_inverses, guard.direct, strict=True)]
         self.inputs = jnp.full_like(self.limit, jnp.inf)
-        for found in known:
-            self.inputs = jnp.minimum(self.inputs, found)
+        if rounding.outward():
+            for i, j in enumerate(guard.direct):
+                self.inputs = jnp.minimum(self.inputs, spread(guard.input_inverses[i], reach(d_fixed[j])))
 
     def input_reach(self, box: Interval) -> Any:
         """Bound of ``|d[k-1]|``, (p,), from a box of x[k]."""

@@ -4,12 +4,12 @@ A gain and a left inverse are numbers of a floating type, and taken as they stan
 
     f + B u + w = x[k] - G d,     g + D u + v - y = -H d,     z - T2 v = C x[k] + psi(x[k]),
 
-into a bound of `Bank`: what is left of x[k] and of d[k-1] beyond what is asked for is a matrix times either, of the size
-of rounding. Both are unknown, and d has no bound. But both are finite, and what is left is small, so they bound each
-other (`contraction.Slips`). Fractions make these matrices exact, and then they are rounded up.
+into a bound of `Bank`: what is left of x[k] and of d[k-1] beyond what is asked for is a matrix times either, of the
+size of rounding. Both are unknown, and d has no bound. But both are finite, and what is left is small, so they bound
+each other (`contraction.Slips`). Fractions make these matrices exact, and then they are rounded up.
 
-T2 annihilates the H of the declared rank. Where T2 times the H that was written is not exactly 0, the H of the promise is
-another one, within `H_slack` of it; that is accounted for as well.
+T2 annihilates the H of the declared rank. Where T2 times the H that was written is not exactly 0, the H of the promise
+is another one, within `H_slack` of it; that is accounted for as well.
 
 Source: design 4.1 and 6.
 """
@@ -92,8 +92,8 @@ def row_slips(rows: Any, known: Any, plant: Any, identity: bool, bounded: Any, H
 def upper_inverse(M: np.ndarray) -> np.ndarray | None:
     """V >= 0 with ``V (I - M) >= I`` entry by entry, proved in fractions; None where ``I - M`` is no M-matrix.
 
-    Then ``z <= M z + b`` with z >= 0 gives ``z <= V b``: multiply ``(I - M) z <= b`` by V. Where rows do not see each other,
-    directly or through others, V is exactly 0, so an infinite b_j stays with those that it concerns.
+    Then ``z <= M z + b`` with z >= 0 gives ``z <= V b``: multiply ``(I - M) z <= b`` by V. Where rows do not see each
+    other, directly or through others, V is exactly 0, so an infinite b_j stays with those that it concerns.
     """
     n = len(M)
     if not n:

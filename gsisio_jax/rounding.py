@@ -2,10 +2,10 @@
 
 **Model.** For +, -, *, / and the square root the result on the machine is ``exact (1 + a) + b`` with ``|a| <= 2 u``,
 ``|b| <= tiny``: u = eps / 2 is the unit roundoff and tiny the smallest normal number. IEEE arithmetic gives a = u and
-b < tiny. The rest of the room is for what XLA makes of a program: ``x / c`` becomes ``x * (1 / c)`` (a second rounding),
-``a b + c`` is contracted (one rounding less), constants are reassociated (their sum rounds once), and numbers below tiny
-are flushed to zero, on their way in or out (b). Fast-math and tf32 are outside of this model; no matrix product is
-used, so no precision flag can bring tf32 in. A subnormal constant or measurement counts as zero.
+b < tiny. The rest of the room is for what XLA makes of a program: ``x / c`` becomes ``x * (1 / c)`` (a second
+rounding), ``a b + c`` is contracted (one rounding less), constants are reassociated (their sum rounds once), and
+numbers below tiny are flushed to zero, on their way in or out (b). Fast-math and tf32 are outside of this model; no
+matrix product is used, so no precision flag can bring tf32 in. A subnormal constant or measurement counts as zero.
 
 **Widening.** ``down(x) = x - (c |x| + t)`` with ``c = ulps * eps`` and ``t = 4 tiny``: three operations and no
 `nextafter`. For an x that is off by ``2 u |x| + tiny`` (one operation), ``ulps = 2`` proves ``down(x) <= exact``: the
@@ -189,17 +189,19 @@ def known_product(x: Any, y: Any) -> tuple[Any, Any]:
     """Lower and upper bound of ``x * y`` for NumPy arrays, ``0 * inf = 0``; one array where every product is exact."""
     with np.errstate(all="ignore"):
         product = np.asarray(x * y)
-        product = np.where((np.equal(x, 0)) | (np.equal(y, 0)), product.dtype.type(0), product)
+        nothing = np.equal(x, 0) | np.equal(y, 0)
+        product = np.where(nothing, product.dtype.type(0), product)
         if product.dtype != np.float64:
-            return _neighbours(product, np.float64(x) * np.float64(y) - product)
+            return _neighbours(product, np.where(nothing, 0, np.float64(x) * np.float64(y) - product))
         (a, b), (c, d) = _halves(x), _halves(y)
         lost = ((a * c - product) + a * d + b * c) + b * d
         small = (np.abs(product) < 1e-290) & (np.not_equal(x, 0) & np.not_equal(y, 0))
-        return _neighbours(product, np.where(small, np.nan, lost))
+        return _neighbours(product, np.where(nothing, 0, np.where(small, np.nan, lost)))
 
 
 def _halves(x: Any) -> tuple[Any, Any]:
     """Veltkamp's split of a float64 into two numbers of 26 bits."""
+    x = np.asarray(x)
     large = x * 134217729.0
     high = large - (large - x)
     return high, x - high
@@ -228,6 +230,7 @@ def normal(lower: Any, upper: Any) -> tuple[Any, Any]:
 def _normal(x: Any, side: float) -> Any:
     tiny = float(jnp.finfo(x.dtype).tiny)
     if isinstance(x, np.ndarray | np.generic):
+        x = np.asarray(x)
         outward_side = np.where(x * side > 0, x.dtype.type(side * tiny), x.dtype.type(0))
         return np.where((x != 0) & (np.abs(x) < tiny), outward_side, x)
     # By its bits: a comparison may already see zero.

@@ -133,10 +133,10 @@ def design_observer(
     bank = distinct(bank)
     steady = problem.steady_width(bank[0])
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
-    form, slack = first_form(system, feedthrough.T2, u_region)
+    outputs, slack = first_form(system, feedthrough.T2, u_region)
     observer = assemble(plan, problem, box, bank, input_bounds(problem, width), everywhere.affine, methods, sweeps)
-    observer = guarded(observer, system, slopes, everywhere, form, slack, np.float64)
-    check_first_sweep(problem, bank[0], observer, form)
+    observer = guarded(observer, system, slopes, everywhere, outputs, slack, np.float64)
+    check_first_sweep(problem, bank[0], observer, outputs)
     if not missing:
         return observer
     certificate = replace(observer.certificate, recoverable=recovers(observer, width, u_region))

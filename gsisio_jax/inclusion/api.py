@@ -209,7 +209,7 @@ def _finish_range(node: Node) -> Interval:
 
 
 def _finish_affine(node: Node, box: Interval) -> AffineForm:
-    slope, offset = slope_of(node, box), guard(node.offset if node.form is None else node.form.folded())
+    slope, offset = slope_of(node, Domain.of(box)), guard(node.offset if node.form is None else node.form.folded())
     # Slopes that overflowed say nothing: slope 0 does.
     bounds = guard(node.range)
     if is_known(slope):

@@ -89,7 +89,7 @@ def _weighed(pairs: Sequence[tuple[Any, Node]], box: Any) -> tuple[Any, Any]:
         for (weight, node), slope, product in zip(pairs, slopes, products, strict=True)
     ]
     total = products[0] + products[1]
-    return total, sum_slack(*slacks, added_slack(*products, total))
+    return total, sum_slack(*slacks, added_slack(products[0], products[1], total))
 
 
 def divide(x: Any, y: Any) -> Node:

@@ -21,8 +21,8 @@ every release of JAX). The largest errors seen on CPU with jax 0.10, in eps of t
     t^k            k/2           k/2          k + 4  |  t^p            0.5  0.7      1.1  1.0     16 (p < 1/2: 1024)
     softplus       1.5  1.9      1.2  1.0     512    |  sine, cosine   proved, see `elementary`
 
-The margin is a factor of two where an error grows with the argument and is understood (a rounded factor of the exponent),
-and four or more elsewhere. sqrt is IEEE's. tan, arctan2 and logaddexp have 64, 16 and 512.
+The margin is a factor of two where an error grows with the argument and is understood (a rounded factor of the
+exponent), and four or more elsewhere. sqrt is IEEE's. tan, arctan2 and logaddexp have 64, 16 and 512.
 
 Source: design 5 and 6.
 """

@@ -10,10 +10,10 @@ roundoff, for ``|t| < LIMIT``:
 - Truncation. The series alternate with falling terms, so each errs by less than its first missing term: ``y^17 / 17!``
   and ``y^18 / 18!`` (float32: ``y^11 / 11!`` and ``y^12 / 12!``), at most ``0.55 u`` (float32: ``0.1 u``), relative to
   ``|y|`` for the sine.
-- Evaluation. ``y + y z p`` with ``|z p| < 0.11`` and ``1 - z / 2 + z^2 q`` with ``|z^2 q| < 0.016``: one rounding of the
-  result, and one or two of terms that are an eighth of it or less, in any contraction: ``1.5 u``.
+- Evaluation. ``y + y z p`` with ``|z p| < 0.11`` and ``1 - z / 2 + z^2 q`` with ``|z^2 q| < 0.016``: one rounding of
+  the result, and one or two of terms that are an eighth of it or less, in any contraction: ``1.5 u``.
 
-Together ``4 u = 2 eps`` absolutely, and ``2 eps |t|`` for the sine (k = 0: relative; else ``|t| > 0.78`` and k > 0 above).
+Together ``4 u = 2 eps`` absolutely, and ``3 eps |t|`` for the sine (k = 0: relative; else ``|t| > 0.78``).
 Only the contraction of ``a b + c`` and nothing else may be rearranged, which holds without fast-math.
 
 Source: design 6 and 12.

@@ -2,8 +2,8 @@
 
 What does not depend on the box is evaluated as usual, so constants need no rule: an expression of constants counts as
 the number that it evaluates to. Where it depends on data that are not known while tracing (a known input, say), its
-rounding is bounded too, by a box that holds all it may be. The derivative rules a function may carry are ignored: bounds
-come from its body.
+rounding is bounded too, by a box that holds all it may be. The derivative rules a function may carry are ignored:
+bounds come from its body.
 """
 
 from __future__ import annotations

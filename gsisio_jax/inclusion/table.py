@@ -97,7 +97,7 @@ def _convert(eqn: Any, x: Node) -> Node:
     """Between floating types the bounds follow; an integer is carried as the floating number it is."""
     target = eqn.params["new_dtype"]
     if jnp.issubdtype(target, jnp.floating):
-        if jnp.finfo(target).bits < jnp.finfo(x.dtype).bits:
+        if jnp.issubdtype(x.dtype, jnp.floating) and jnp.finfo(target).bits < jnp.finfo(x.dtype).bits:
             # Bounds are those of the number before it is rounded to the narrower type, as for every other operation.
             narrow = x.range.astype(target)
             jac = None if x.jac is None else x.jac.astype(target)

@@ -10,10 +10,11 @@ The slope is always the derivative at some point m, so the critical points of ``
 solving anything: m itself and, where the derivative is an even function, -m. By the envelope theorem they can be held
 fixed when a gradient is taken.
 
-Rounding. Values of the function are padded by `ulps` of the table (`curves`). For the rest, any slope is sound, so let s
-be the number that was computed, and ``s + e`` the exact derivative at m, ``|e| <= ulps eps |s| + tiny``. The extremes of
-``phi(t) - (s + e) t`` over [a, b] lie among the points looked at, so those of ``phi(t) - s t`` differ from the values
-there by at most ``|e| (b - a)``; that, the rounding of ``phi(t_i)`` and that of ``s t_i`` are what `_rest` adds.
+Rounding. Values of the function are padded by `ulps` of the table (`curves`). For the rest, any slope is sound, so let
+s be the number that was computed, and ``s + e`` the exact derivative at m, ``|e| <= ulps eps |s| + tiny``. The
+extremes of ``phi(t) - (s + e) t`` over [a, b] lie among the points looked at, so those of ``phi(t) - s t`` differ from
+the values there by at most ``|e| (b - a)``; that, the rounding of ``phi(t_i)`` and that of ``s t_i`` are what `_rest`
+adds.
 
 Source: design 5 and 6.
 """
@@ -263,11 +264,11 @@ def _middle(a: Any, b: Any) -> tuple[Any, Any, Any]:
 def _wave_padded(exact: Interval, cosine: bool, m: Any, r: Any) -> Interval:
     """Outward by what the formulas of `Wave` lose.
 
-    With SLOT = 2, `sin_cos` is off by 2 eps at most, and by ``2 eps |t|`` in the sine. m and r are off by ``eps (|m| +
+    With SLOT = 2, `sin_cos` is off by 2 eps at most, and by ``3 eps |t|`` in the sine. m and r are off by ``eps (|m| +
     r)`` together, and the derivative of every bound here by m or r is at most 2 in magnitude. Every product of two or
-    three such values, and sum of three, stays below ``14 eps (k + |m| + r)``, k = 1 for a cosine and 0 for a sine, which
-    vanishes with m and r. A crest that rounding hides lies within ``4 eps (|m| + r)`` of an end: half of the square of
-    that is what the value there misses, below ``eps`` times this again within `LIMIT`.
+    three such values, and sum of three, stays below ``14 eps (k + |m| + r)``, k = 1 for a cosine and 0 for a sine,
+    which vanishes with m and r. A crest that rounding hides lies within ``4 eps (|m| + r)`` of an end: half of the
+    square of that is what the value there misses, below ``eps`` times this again within `LIMIT`.
     """
     if not rounding.outward():
         return exact
@@ -429,7 +430,8 @@ class Hinge:
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
         low, high = jnp.isfinite(a), jnp.isfinite(b)
         bent = (a < 0) & (b > 0)
-        cut = bent & low & high
+        # Narrower than this, a secant has no gradient; any slope is as good.
+        cut = bent & low & high & (b - a > float(jnp.finfo(a.dtype).tiny) ** 0.25)
         a0, b0 = jnp.where(cut, a, -1), jnp.where(cut, b, 1)
         s = (b0 - self.left * a0) / (b0 - a0)
         # With one end infinite the slope of the infinite side leaves a bounded rest; with both, nothing does.

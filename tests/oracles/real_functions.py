@@ -1,8 +1,7 @@
 """Real functions of one variable and their derivatives, to more digits than what they judge.
 
-In NumPy's long double (64 bits of mantissa, where the platform has it) for many points at once, and in python-flint's balls
-of 256 bits, which bound their own error, for few. The first is checked with the second.
-"""
+In NumPy's long double (64 bits of mantissa, where the platform has it) for many points at once, and in python-flint's
+balls of 256 bits, which bound their own error, for few. The first is checked with the second."""
 
 from __future__ import annotations
 
@@ -78,7 +77,9 @@ _LOG2 = np.log(LONG(2))
 FUNCTIONS: dict[str, Real] = {
     "sin": Real(jnp.sin, np.sin, np.cos, lambda t: t.sin(), lambda t: t.cos(), largest=1e15),
     "cos": Real(jnp.cos, np.cos, lambda t: -np.sin(t), lambda t: t.cos(), lambda t: -t.sin(), largest=1e15),
-    "tan": Real(jnp.tan, np.tan, lambda t: 1 + np.tan(t) ** 2, lambda t: t.tan(), lambda t: 1 / t.cos() ** 2, largest=50),
+    "tan": Real(
+        jnp.tan, np.tan, lambda t: 1 + np.tan(t) ** 2, lambda t: t.tan(), lambda t: 1 / t.cos() ** 2, largest=50
+    ),
     "exp": Real(jnp.exp, _exp, _exp, lambda t: t.exp(), lambda t: t.exp()),
     "exp2": Real(
         jnp.exp2, lambda t: np.exp2(t), lambda t: _LOG2 * np.exp2(t),
@@ -87,12 +88,16 @@ FUNCTIONS: dict[str, Real] = {
     "expm1": Real(jnp.expm1, np.expm1, _exp, lambda t: t.expm1(), lambda t: t.exp()),
     "log": Real(jnp.log, np.log, lambda t: 1 / t, lambda t: t.log(), lambda t: 1 / t, (0.0, INF)),
     "log1p": Real(jnp.log1p, np.log1p, lambda t: 1 / (1 + t), lambda t: t.log1p(), lambda t: 1 / (1 + t), (-1.0, INF)),
-    "sqrt": Real(jnp.sqrt, np.sqrt, lambda t: 0.5 / np.sqrt(t), lambda t: t.sqrt(), lambda t: 1 / (2 * t.sqrt()), (0.0, INF)),
+    "sqrt": Real(
+        jnp.sqrt, np.sqrt, lambda t: 0.5 / np.sqrt(t), lambda t: t.sqrt(), lambda t: 1 / (2 * t.sqrt()), (0.0, INF)
+    ),
     "rsqrt": Real(
         lax.rsqrt, lambda t: 1 / np.sqrt(t), lambda t: -0.5 / (t * np.sqrt(t)),
         lambda t: 1 / t.sqrt(), lambda t: -1 / (2 * t * t.sqrt()), (0.0, INF),
     ),
-    "cbrt": Real(jnp.cbrt, np.cbrt, lambda t: 1 / (3 * np.cbrt(t) ** 2), _ball_root, lambda t: 1 / (3 * _ball_root(t) ** 2)),
+    "cbrt": Real(
+        jnp.cbrt, np.cbrt, lambda t: 1 / (3 * np.cbrt(t) ** 2), _ball_root, lambda t: 1 / (3 * _ball_root(t) ** 2)
+    ),
     "square": _power(2.0),
     "cube": _power(3.0),
     "fifth": _power(5.0),
@@ -123,14 +128,16 @@ FUNCTIONS: dict[str, Real] = {
         lambda t: t.acos(), lambda t: -1 / (1 - t * t).sqrt(), (-1.0, 1.0),
     ),
     "asinh": Real(
-        jnp.arcsinh, np.arcsinh, lambda t: 1 / np.hypot(LONG(1), t), lambda t: t.asinh(), lambda t: 1 / (1 + t * t).sqrt(),
+        jnp.arcsinh, np.arcsinh, lambda t: 1 / np.hypot(LONG(1), t),
+        lambda t: t.asinh(), lambda t: 1 / (1 + t * t).sqrt(),
     ),
     "acosh": Real(
         jnp.arccosh, np.arccosh, lambda t: 1 / np.sqrt((t - 1) * (t + 1)),
         lambda t: t.acosh(), lambda t: 1 / (t * t - 1).sqrt(), (1.0, INF),
     ),
     "atanh": Real(
-        jnp.arctanh, np.arctanh, lambda t: 1 / ((1 - t) * (1 + t)), lambda t: t.atanh(), lambda t: 1 / (1 - t * t), (-1.0, 1.0),
+        jnp.arctanh, np.arctanh, lambda t: 1 / ((1 - t) * (1 + t)),
+        lambda t: t.atanh(), lambda t: 1 / (1 - t * t), (-1.0, 1.0),
     ),
     "over 49": _divided(49.0),
     "over 103": _divided(103.0),

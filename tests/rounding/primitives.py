@@ -87,7 +87,8 @@ def count_misses(
     natural, met, slope, offset, jac = bounds
     for box in (natural, met, offset, jac):
         assert box.lower.dtype == dtype, f"{name}: promoted to {box.lower.dtype}"
-        assert not (np.isnan(box.lower).any() or np.isnan(box.upper).any()), f"{name}: NaN"
+        assert not np.isnan(box.lower).any(), f"{name}: NaN"
+        assert not np.isnan(box.upper).any(), f"{name}: NaN"
         assert (box.lower <= box.upper).all(), f"{name}: crossed"
     t = points(rng, lower, upper, each, real)
     low, high = real.domain

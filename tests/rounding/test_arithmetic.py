@@ -76,8 +76,8 @@ def test_overflow_is_infinite_and_not_wrong():
     total = inclusion.natural(lambda x: jnp.stack([x[0] + x[0] - x[0], x[0] * x[0], 1 / (x[0] * x[0]), jnp.exp(x[0])]))(
         big
     )
-    assert (total.lower[:2] == [-np.inf, -np.inf]).all()
-    assert (total.upper[:2] == [np.inf, np.inf]).all()
+    assert np.asarray(total.lower[:2]).tolist() == [-np.inf, -np.inf]
+    assert np.asarray(total.upper[:2]).tolist() == [np.inf, np.inf]
     assert total.lower[2] <= 1e-320
     assert total.upper[3] == np.inf
     assert not np.isnan(np.asarray(total.lower)).any()
@@ -101,11 +101,12 @@ def test_gradients_do_not_see_the_widening(dtype):
 
         def width(pair, mode):
             form = inclusion.affine(f, mode)(Interval.unchecked(pair[0], pair[1]))
-            return jnp.where(jnp.isfinite(form.range.width), form.range.width, 0) + form.offset.lower
+            return sum(jnp.where(jnp.isfinite(v), v, 0) for v in (form.range.width, form.offset.lower))
 
         found = [np.asarray(jax.grad(width)(jnp.asarray(box), mode)) for mode in ("outward", "nearest")]
         assert np.isfinite(found[0]).all()
-        np.testing.assert_allclose(found[0], found[1], rtol=1e-4 if dtype == np.float32 else 1e-9, atol=1e-5)
+        if upper[1] > lower[1]:  # at a point another slope may be taken
+            np.testing.assert_allclose(found[0], found[1], rtol=1e-4 if dtype == np.float32 else 1e-9, atol=1e-5)
 
 
 def test_known_numbers_round_only_where_they_must():
