@@ -104,7 +104,7 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
     evidence, promised = _certified(observer, evidence, before, right, terms, missed, carry.u, u)
     d, evidence = _inputs(observer, evidence, d_fixed, form)
     d, evidence = _certified_input(observer, evidence, promised, missed, d)
-    d, evidence = _exact_input(observer, evidence, add(h.range, shift), terms, missed, d)
+    d, evidence = _exact_input(observer, evidence, add(h.range, shift), terms, d, missed)
     return evidence, alone, d
 
 
@@ -263,7 +263,7 @@ def _inputs(observer: Observer, evidence: Evidence, fixed: Interval, form: Affin
 
 
 def _exact_input(
-    observer: Observer, evidence: Evidence, known: Interval, terms: Terms, missed: _Missed, d: Interval
+    observer: Observer, evidence: Evidence, known: Interval, terms: Terms, d: Interval, missed: _Missed | None = None
 ) -> tuple[Interval, Evidence]:
     """The exact box of d[k-1] for ``[G; H] d`` in a box, that of ``[x[k]; 0] - known`` (paper, Lemma 3; design 4.5)."""
     exact, box = observer.exact, evidence.box
@@ -275,12 +275,12 @@ def _exact_input(
         Interval.unchecked(-known.upper, -known.lower),
     )
     rows = add(image(exact.rows, explained), image(exact.known, terms.known))
-    rows = widen(rows, missed.of_inputs(observer.guard.rows, box))
+    rows = rows if missed is None else widen(rows, missed.of_inputs(observer.guard.rows, box))
     met = Evidence(d, evidence.scale).meet(rows, Source.INPUT)
     evidence = evidence.weigh(met.slacks[0], Source.INPUT)
     # Some d must reach the box at all: every combination of rows that is free of d contains 0.
     balance = add(image(exact.circuits, explained), image(exact.circuits_known, terms.known))
-    balance = widen(balance, missed.of_inputs(observer.guard.circuits, box))
+    balance = balance if missed is None else widen(balance, missed.of_inputs(observer.guard.circuits, box))
     return met.box, evidence.weigh(jnp.minimum(balance.upper, -balance.lower), Source.BALANCE)
 
 

@@ -62,12 +62,19 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
         if not adds or is_zeros(values):
             return result
         size = run(call, *map(abs, values))
+        if is_known(result):
+            # Where at most one of the terms is not 0, nothing was rounded.
+            size = np.where(run(call, *((v != 0).astype(v.dtype) for v in values)) > 1, size, 0)
+            return np.where(size == 0, result, result + sign * rounding.error(size, terms))
         return rounding.lowered(result, size, terms) if sign < 0 else rounding.raised(result, size, terms)
 
     def both(pairs: Sequence[Interval], call: Callable[..., Any]) -> list[Interval]:
         lower = side([p.lower for p in pairs], call, -1)
-        same = all(is_point(p) for p in pairs) and (not adds or is_zeros([p.lower for p in pairs]))
+        points = all(is_point(p) for p in pairs)
+        same = points and (not adds or is_zeros([p.lower for p in pairs]))
         upper = lower if same else side([p.upper for p in pairs], call, 1)
+        if points and is_known(lower) and is_known(upper) and np.array_equal(lower, upper):
+            upper = lower
         return [Interval.unchecked(a, b) for a, b in zip(as_list(lower), as_list(upper), strict=True)]
 
     along = jax.vmap(fn)
