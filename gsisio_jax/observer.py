@@ -192,7 +192,8 @@ def in_type(observer: Observer, dtype: Any) -> Observer:
     if found is None:
         from gsisio_jax.guard import single_precision
 
-        found = single_precision(observer)
+        with jax.ensure_compile_time_eval():  # the observer's numbers are known, also while something else is traced
+            found = single_precision(observer)
         object.__setattr__(observer, "_single", found)
     return found
 
