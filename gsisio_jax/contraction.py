@@ -320,7 +320,8 @@ def centred(
     middle = right.center
     c = jnp.clip(middle, within.lower, within.upper)
     for _ in range(rounds):
-        c = jnp.clip(middle - _vector(N_z, remainder(c)), within.lower, within.upper)
+        moved = (middle - _vector(N_z, remainder(c))).astype(middle.dtype)  # constants of g may have promoted it
+        c = jnp.clip(moved, within.lower, within.upper)
     moved = add(Interval.unchecked(middle, middle), image(-N_z, bounded_remainder(c)))
     moved = Interval.unchecked(*(jnp.clip(side, within.lower, within.upper) for side in (moved.lower, moved.upper)))
     move = rounding.up(jnp.maximum(abs(moved.upper - c), abs(c - moved.lower)))

@@ -239,7 +239,13 @@ def _around(observer: Observer, row: Bank, slope: Any, promised: _Promised) -> I
 
     No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
     """
-    at = inclusion.natural(observer.system.maps)(_point(promised.center), promised.u_before)
+    maps, center = observer.system.maps, promised.center
+    outward = rounding.outward()
+    at = (
+        inclusion.natural(maps)(_point(center), promised.u_before)
+        if outward
+        else _point(maps(center, promised.u_before).astype(center.dtype))
+    )
     return add(widen(image(row.residual, at), spread(slope, promised.radius)), row.linear(promised.terms))
 
 
@@ -371,6 +377,8 @@ def _psi(observer: Observer, u: Any) -> Any:
 
 def _psi_box(observer: Observer, u: Any) -> Any:
     """The same at a point, as a box."""
+    if not rounding.outward():
+        return lambda x: _point(_psi(observer, u)(x))
     return lambda x: inclusion.natural(_psi(observer, u))(_point(x))
 
 

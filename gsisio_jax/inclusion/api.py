@@ -26,6 +26,7 @@ from gsisio_jax.inclusion.node import (
     slack_of,
     slope_image,
     slope_of,
+    sum_slack,
 )
 from gsisio_jax.interval import Interval, choose
 from gsisio_jax.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
@@ -70,7 +71,7 @@ def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable
         UnknownPrimitiveError: f uses an operation without known bounds.
         ValueError: the first argument is no box of shape (n,).
 
-    >>> natural(lambda x: jnp.sqrt(x[0]) - x[1])(Interval([0.0, 1.0], [4.0, 2.0]))
+    >>> natural(lambda x: jnp.sqrt(x[0]) - x[1], rounding="nearest")(Interval([0.0, 1.0], [4.0, 2.0]))
     Interval(-2.0, 1.0)
 
     Source: design 5.
@@ -90,7 +91,7 @@ def affine(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[
     Arguments and errors are those of `natural`. Exact, with an offset of width 0, where f is affine; infinite boxes
     are legal, and the offset stays finite where a finite one exists for the chosen slope.
 
-    >>> form = affine(lambda x: 2 * x[0] + jnp.sin(x[1]))(Interval.entire(2))
+    >>> form = affine(lambda x: 2 * x[0] + jnp.sin(x[1]), rounding="nearest")(Interval.entire(2))
     >>> form.slope.tolist(), form.offset
     ([2.0, 0.0], Interval(-1.0, 1.0))
 
@@ -113,7 +114,7 @@ def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callabl
     jump inside the box the bounds are infinite, and where it has a kink they are the hull of both sides.
     Arguments and errors are those of `natural`.
 
-    >>> jacobian(lambda x: jnp.abs(x[0]) + 3 * x[1])(Interval([-1.0, 0.0], [1.0, 1.0]))
+    >>> jacobian(lambda x: jnp.abs(x[0]) + 3 * x[1], rounding="nearest")(Interval([-1.0, 0.0], [1.0, 1.0]))
     Interval([-1.  3.], [1. 3.])
 
     Source: design 5.
@@ -196,7 +197,21 @@ def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable
     results = evaluate(closed.jaxpr, closed.consts, inputs)
     nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
     nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
-    return jax.tree.unflatten(jax.tree.structure(out), [finish(node) for node in nodes])
+    return jax.tree.unflatten(jax.tree.structure(out), [finish(_in_type(node, x.dtype)) for node in nodes])
+
+
+def _in_type(node: Node, dtype: Any) -> Node:
+    """What a constant of f has promoted comes back in the type of the box, rounded outward."""
+    if node.dtype == dtype:
+        return node
+    form = node.form
+    if form is not None:
+        slope = jnp.asarray(form.slope).astype(dtype)
+        lost = abs(slope) * np.dtype(dtype).type(2 * jnp.finfo(dtype).eps)
+        slack = sum_slack(lost, None if form.slack is None else (2 * form.slack).astype(dtype))
+        domain = Domain(*(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.reach)))
+        form = Form(slope, form.offset.astype(dtype), domain, slack)
+    return Node(node.range.astype(dtype), form, None if node.jac is None else node.jac.astype(dtype))
 
 
 def _as_numbers(node: Node, dtype: Any) -> Node:

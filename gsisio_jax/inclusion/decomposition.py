@@ -138,6 +138,7 @@ def decomposition(
         f: takes an array of shape (n,), then any number of further arguments; returns an array of any shape.
         derivative: box (*out, n) that contains all difference quotients of f on every box it will be used on, sides
             infinite where unknown; nothing can detect a wrong one. None: `inclusion.jacobian` on the box at hand.
+        rounding: as in `natural`.
 
     Returns:
         A function of a box (n,) and of the further arguments, arrays or boxes, that returns an `Interval` of the shape
@@ -147,7 +148,7 @@ def decomposition(
         UnknownPrimitiveError: f uses an operation without known bounds (with `derivative`: only for boxes in `args`).
         ValueError: the first argument is no box of shape (n,); `derivative` has the wrong shape, is NaN or crossed.
 
-    >>> decomposition(lambda x: x[0] ** 2 - x[1])(Interval([-1.0, 0.0], [2.0, 1.0]))
+    >>> decomposition(lambda x: x[0] ** 2 - x[1], rounding="nearest")(Interval([-1.0, 0.0], [2.0, 1.0]))
     Interval(-6.0, 10.0)
 
     Source: paper, Prop. 2 and (eq:decompconstruct); design 5.
@@ -174,7 +175,7 @@ def remainder(f: Callable[..., Any], derivative: Any = None, rounding: Rounding 
     Args, returns and errors are those of `decomposition`; n > 10 is a ValueError too.
 
     >>> box = Interval([-1.0, 0.0], [3.0, 1.0])
-    >>> [form(lambda x: jnp.abs(x[0]) - x[1])(box) for form in (decomposition, remainder)]
+    >>> [form(lambda x: jnp.abs(x[0]) - x[1], rounding="nearest")(box) for form in (decomposition, remainder)]
     [Interval(-4.0, 7.0), Interval(-2.0, 5.0)]
 
     Source: Khajenejad and Yong, tight remainder-form decomposition functions; design 5.
@@ -215,7 +216,8 @@ def tight(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | No
 
     Args, returns and errors are those of `decomposition`; f's operations need known bounds in any case.
 
-    >>> tight(lambda x: jnp.stack([x[0] ** 2 - x[1], x[0] ** 3 + x[0]]))(Interval([-1.0, 0.0], [2.0, 1.0]))
+    >>> pair = lambda x: jnp.stack([x[0] ** 2 - x[1], x[0] ** 3 + x[0]])
+    >>> tight(pair, rounding="nearest")(Interval([-1.0, 0.0], [2.0, 1.0]))
     Interval([-1. -2.], [ 4. 10.])
 
     Source: design 5; the center is that of Baumann, Optimal centered forms, BIT 28 (1988).

@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,10 +45,12 @@ _PLAIN = (-1.0, 0.0, 0.25, 1.0, 2.0)  # limits of functions that are numbers of 
 def apply(curve: Any, x: Node) -> Node:
     """Apply a function of one variable to a node, in all domains."""
     a, b = x.range.lower, x.range.upper
-    natural = guard(curve.range(a, b))
+    # What range, line and derivative of a wave have in common is computed once.
+    shared = (curve.parts(a, b),) if isinstance(curve, Wave) else ()
+    natural = guard(curve.range(a, b, *shared))
     form = None
     if x.form is not None:
-        s, rest = curve.line(a, b, natural)
+        s, rest = curve.line(a, b, natural, *shared)
         slope, offset = s * x.form.slope, x.form.offset
         up = s >= 0
         first, last = (times(s, jnp.where(mask, offset.lower, offset.upper)) for mask in (up, ~up))
@@ -59,7 +61,7 @@ def apply(curve: Any, x: Node) -> Node:
             slack = scaled_slack(s, x.form.slope, slope, x.form.slack)
             size = slope_reach(slope, x.form.box)
         form = best_form(slope, Interval.unchecked(lower, upper), natural, x.form.box, slack, size)
-    jac = None if x.jac is None else product(guard(curve.derivative(a, b)), x.jac)
+    jac = None if x.jac is None else product(guard(curve.derivative(a, b, *shared)), x.jac)
     return Node(natural, form, jac)
 
 
@@ -222,6 +224,18 @@ class Curve:
         return s, choose(usable, rest, natural)
 
 
+class _WaveParts(NamedTuple):
+    """Is the interval usable; its middle m and half-width r; sine and cosine of m and of r / 2."""
+
+    usable: Any
+    m: Any
+    r: Any
+    sine: Any
+    cosine: Any
+    half_sin: Any
+    half_cos: Any
+
+
 @dataclass(frozen=True)
 class Wave:
     """``sin`` or ``cos``.
@@ -232,17 +246,20 @@ class Wave:
 
     cosine: bool
 
-    def range(self, a: Any, b: Any) -> Interval:
-        return _wave_range(self.cosine, 1.0, a, b)
-
-    def derivative(self, a: Any, b: Any) -> Interval:
-        return _wave_range(not self.cosine, -1.0 if self.cosine else 1.0, a, b)
-
-    def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
+    def parts(self, a: Any, b: Any) -> _WaveParts:
+        """What all three need."""
         usable, m, r = _middle(a, b)
-        sine, cosine = sin_cos(m)
+        return _WaveParts(usable, m, r, *sin_cos(m), *sin_cos(0.5 * r))
+
+    def range(self, a: Any, b: Any, parts: _WaveParts | None = None) -> Interval:
+        return _wave_range(self.cosine, 1.0, parts or self.parts(a, b))
+
+    def derivative(self, a: Any, b: Any, parts: _WaveParts | None = None) -> Interval:
+        return _wave_range(not self.cosine, -1.0 if self.cosine else 1.0, parts or self.parts(a, b))
+
+    def line(self, a: Any, b: Any, natural: Interval, parts: _WaveParts | None = None) -> tuple[Any, Interval]:
+        usable, m, r, sine, cosine, half_sin, half_cos = parts or self.parts(a, b)
         value, steepness = (cosine, -sine) if self.cosine else (sine, cosine)
-        half_sin, half_cos = sin_cos(0.5 * r)
         # With slope phi'(m) cos(r/2) the odd part of the rest, sin h - h cos(r/2), has its critical points at
         # +-r/2. It is then four times smaller than with the tangent, and no arccosine is needed.
         s = steepness * half_cos
@@ -282,12 +299,10 @@ def _crosses(phase: float, period: float, a: Any, b: Any) -> Any:
     return jnp.ceil((a - phase) / period) <= (b - phase) / period
 
 
-def _wave_range(cosine: bool, sign: float, a: Any, b: Any) -> Interval:
+def _wave_range(cosine: bool, sign: float, parts: _WaveParts) -> Interval:
     """Range of ``sign`` times the sine or the cosine."""
-    usable, m, r = _middle(a, b)
-    sine, other = sin_cos(m)
+    usable, m, r, sine, other, half_sin, half_cos = parts
     value, steepness = (other, sine) if cosine else (sine, other)
-    half_sin, half_cos = sin_cos(0.5 * r)
     even, odd = sign * value * (1 - 2 * half_sin**2), jnp.abs(steepness) * 2 * half_sin * half_cos
     a, b = m - r, m + r
     crest = (0.0 if cosine else np.pi / 2) + (np.pi if sign < 0 else 0.0)
