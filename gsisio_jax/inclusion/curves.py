@@ -35,7 +35,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax.inclusion.univariate import INF, Curve, Hinge, Piece, Pole, Tangent, Wave
+from gsisio_jax.inclusion.univariate import INF, Curve, Hinge, Piece, Pole, Tangent
+from gsisio_jax.inclusion.waves import Wave
 
 
 def _root(t: Any) -> Any:
