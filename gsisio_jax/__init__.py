@@ -5,18 +5,19 @@ from typing import TYPE_CHECKING, Any
 from gsisio_jax import estimation, inclusion
 from gsisio_jax.alarms import Alarm
 from gsisio_jax.certificate import Certificate
-from gsisio_jax.errors import FramerNotGuaranteed, NoDesignFound, ObserverDoesNotExist
+from gsisio_jax.errors import ContainmentLost, FramerNotGuaranteed, NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.estimation import Estimate, estimate, start, step
 from gsisio_jax.interval import Interval, hull, intersect, linear_image
 from gsisio_jax.observer import Carry, Observer, StepOutput
 from gsisio_jax.prediction import PredictionObserver
+from gsisio_jax.simulation import Simulation, simulate
 from gsisio_jax.status import Status
-from gsisio_jax.system import Noise, Simulation, System, simulate
+from gsisio_jax.system import Noise, System
 
 if TYPE_CHECKING:
     from gsisio_jax import dataset, examples, paper, plot, study
     from gsisio_jax.design import design_observer
-    from gsisio_jax.study import grid, sweep
+    from gsisio_jax.study import grid, monte_carlo, sweep
 
 __version__ = "0.1.0"
 
@@ -24,6 +25,7 @@ __all__ = [
     "Alarm",
     "Carry",
     "Certificate",
+    "ContainmentLost",
     "Estimate",
     "FramerNotGuaranteed",
     "Interval",
@@ -46,6 +48,7 @@ __all__ = [
     "inclusion",
     "intersect",
     "linear_image",
+    "monte_carlo",
     "paper",
     "plot",
     "simulate",
@@ -58,6 +61,7 @@ __all__ = [
 _LAZY = {
     "design_observer": "gsisio_jax.design",
     "grid": "gsisio_jax.study",
+    "monte_carlo": "gsisio_jax.study",
     "sweep": "gsisio_jax.study",
     "dataset": "",
     "examples": "",
