@@ -13,6 +13,7 @@ from gsisio_jax.plot.scales import Scale, merge_of
 from gsisio_jax.plot.study import Quantity, axes_of, prepared, quantities, title_of
 
 CELLS = 1000  # most cells along an axis
+ROUNDING = 1e-9  # relative
 COLORS = "viridis"  # even in lightness, for any colour vision and in print
 INFINITE, UNKNOWN, NEVER = ("////", "infinite: not bounded"), ("....", "no value"), ("....", "never")
 BORDER = "#d55e00"
@@ -122,7 +123,9 @@ def _mesh(dataset: Any, one: Quantity, x: str, y: str) -> Mesh:
     above = np.full(values.shape, np.nan)
     if one.predicted is not None and set(one.predicted.dims) <= {x, y}:
         every = one.predicted.broadcast_like(one.values.isel(dict.fromkeys(rest, 0)))
-        above = np.where(np.isnan(values), np.nan, values > every.transpose(y, x).values[places])
+        # Where the promise is met exactly, rounding must not draw a line.
+        limit = (1 + ROUNDING) * every.transpose(y, x).values[places]
+        above = np.where(np.isnan(values), np.nan, values > limit)
     edges = []
     for dim, scale in zip((1, 0), scales, strict=True):
         starts = style.joined(len(scale.at), CELLS)
