@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 import gsisio_jax
 from gsisio_jax._extras import need
 from gsisio_jax.estimation import AnyObserver
+from gsisio_jax.study import cluster
+from gsisio_jax.study import mesh as devices
 from gsisio_jax.study.axes import Layout
 from gsisio_jax.study.kernel import fingerprint, outline, run_cases, tile_size
 from gsisio_jax.study.labels import Labels, coordinates_of, variables_of
@@ -40,6 +44,8 @@ class Job:
         hold: as in `estimate`, ``on_conflict="hold"``.
         size: cases per tile.
         shapes: of the results of one case.
+        cost: bytes of working set of a case, where the size of a tile was chosen by it.
+        mesh: devices that share a tile, from `mesh.flat`.
     """
 
     call: str
@@ -51,6 +57,8 @@ class Job:
     hold: bool
     size: int
     shapes: dict[str, jax.ShapeDtypeStruct]
+    cost: float | None = None
+    mesh: Mesh | None = None
 
     @classmethod
     def plan(
@@ -79,16 +87,26 @@ class Job:
             observer = observer.astype(dtype)
         one, shared = layout.take(arguments, np.zeros(1, int)), layout.shared(arguments)
         shapes, cost = outline(observer, one, shared, rows, reductions, hold)
-        return cls(
-            call, observer, arguments, layout, rows, reductions, hold, _batch(call, batch, cost, layout.cases), shapes
-        )
+        size, chosen = _batch(call, batch, cost, layout.cases), cost if batch is None else None
+        return cls(call, observer, arguments, layout, rows, reductions, hold, size, shapes, chosen)
+
+    def on(self, mesh: Any) -> Job:
+        """The same study with every tile spread over devices; a chosen tile grows with their number.
+
+        Raises:
+            ValueError: not a mesh of local devices.
+        """
+        mesh = devices.flat(self.call, mesh)
+        size = self.size if self.cost is None else tile_size(self.cost / mesh.size, self.layout.cases)
+        return replace(self, size=size, mesh=mesh)
 
     @cached_property
-    def _shared(self) -> Any:
-        return jax.device_put(self.layout.shared(self.arguments))
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_shared"}
+    def _fixed(self) -> tuple[AnyObserver, Any]:
+        """What all tiles share, on the devices."""
+        shared = self.layout.shared(self.arguments)
+        if self.mesh is None:
+            return self.observer, jax.device_put(shared)
+        return devices.copied(self.observer, self.mesh), devices.copied(shared, self.mesh)
 
     @property
     def tiles(self) -> int:
@@ -101,9 +119,13 @@ class Job:
 
     def start(self, tile: int) -> dict[str, Any]:
         """Results of a tile, started but not waited for; the last one is filled up with its last case."""
-        cases = np.minimum(np.arange(tile * self.size, (tile + 1) * self.size), self.layout.cases - 1)
+        count = self.size if self.mesh is None else devices.padded(self.size, self.mesh)
+        cases = np.minimum(tile * self.size + np.arange(count), self.layout.cases - 1)
         varying = self.layout.take(self.arguments, cases)
-        return run_cases(self.observer, varying, self._shared, self.rows, self.reductions, self.hold)
+        if self.mesh is not None:
+            varying = devices.spread(varying, self.mesh)
+        observer, shared = self._fixed
+        return run_cases(observer, varying, shared, self.rows, self.reductions, self.hold)
 
     def finish(self, tile: int, running: dict[str, Any]) -> Results:
         """Wait for a tile that was started, and check it.
@@ -119,7 +141,9 @@ class Job:
     def fingerprint(self) -> str:
         """Identifies the study by all that its numbers depend on."""
         axes = dict(zip(self.layout.names, self.layout.sizes, strict=True))
-        rest = axes, self.layout.placed, self.size, self.hold
+        rest = [axes, self.layout.placed, self.size, self.hold]
+        if self.mesh is not None and self.mesh.size > 1:
+            rest.append(f"{self.mesh.size} devices")  # each runs a smaller tile, which may round in other places
         return fingerprint(self.observer, self.arguments, self.rows, self.reductions, *rest)
 
 
@@ -144,8 +168,22 @@ def run(
         store: path, or None for memory.
         resume: go on with a store that is there.
         progress: show a bar.
+        client: of a Dask cluster that computes the tiles, or None for this process.
+        mesh: local devices that share every tile, or None.
+
+    Raises:
+        ValueError: `client` and `mesh` together, or one of them cannot be used; or a tile fails.
     """
     xarray = need("xarray", extra="study", purpose="a study")
+    if client is not None and mesh is not None:
+        raise ValueError(
+            f"{job.call}: `client` and `mesh` cannot be combined; give `client` for several machines (each worker uses "
+            "the first device that it sees), or `mesh` for several devices of this one"
+        )
+    if client is not None:
+        cluster.check(job.call, client)
+    if mesh is not None:
+        job = job.on(mesh)
     layout = job.layout
     variables = variables_of((*job.reductions, job.rows), job.shapes, labels)
     coordinates = coordinates_of(layout, job.reductions, labels, variables)
@@ -163,7 +201,11 @@ def run(
             for name, array in results.items():
                 values[name][job.cases(tile)[0] : job.cases(tile)[-1] + 1] = array
 
-        _compute(job, range(job.tiles), keep, progress)
+        with _bar(job, range(job.tiles), progress) as advance:
+            if client is None:
+                _compute(job, range(job.tiles), keep, advance)
+            else:
+                cluster.compute(client, job, range(job.tiles), advance, keep=keep)
         data = {
             name: ((*layout.names, *dims), values[name].reshape((*layout.sizes, *shape)), about)
             for name, (shape, _, dims, about) in variables.items()
@@ -175,36 +217,45 @@ def run(
         axes = dict(zip(layout.names, layout.sizes, strict=True))
         header = Header(layout.cases, job.size, variables, coordinates, attributes, job.fingerprint(), axes)
         tiles = TileStore.open(store, header, resume)
-        _compute(job, tiles.missing(), tiles.write, progress)
+        missing = tiles.missing()
+        with _bar(job, missing, progress) as advance:
+            if client is None:
+                _compute(job, missing, tiles.write, advance)
+            else:
+                cluster.compute(client, job, missing, advance, store=tiles)
         result = tiles.dataset()
     return result.assign(beside(observer, layout, promised(observer.certificate, job.arguments["noise"]), labels))
 
 
-def _compute(job: Job, tiles: Sequence[int], keep: Callable[[int, Results], None], progress: bool) -> None:
-    """Tiles in order, two at a time: one is started before the last one is waited for, so that no core stands idle."""
-    bar = None
-    if progress and tiles and sys.stderr.isatty():
-        tqdm = need("tqdm", extra="study", purpose="a progress bar (progress=False does without)")
-        bar = tqdm.tqdm(total=job.layout.cases, unit="case", unit_scale=True, delay=PATIENCE, leave=False)
+@contextlib.contextmanager
+def _bar(job: Job, tiles: Sequence[int], progress: bool) -> Iterator[Callable[[int], None]]:
+    """What is to be called after every tile; moves a bar where there is a terminal."""
+    if not (progress and tiles and sys.stderr.isatty()):
+        yield lambda tile: None
+        return
+    tqdm = need("tqdm", extra="study", purpose="a progress bar (progress=False does without)")
+    with tqdm.tqdm(total=job.layout.cases, unit="case", unit_scale=True, delay=PATIENCE, leave=False) as bar:
         bar.update(job.layout.cases - sum(len(job.cases(tile)) for tile in tiles))
+        yield lambda tile: bar.update(len(job.cases(tile)))
+
+
+def _compute(
+    job: Job, tiles: Sequence[int], keep: Callable[[int, Results], None], advance: Callable[[int], None]
+) -> None:
+    """Tiles in order, two at a time: one is started before the last one is waited for, so that no core stands idle."""
 
     def finish(tile: int, running: dict[str, Any]) -> None:
         keep(tile, job.finish(tile, running))
-        if bar is not None:
-            bar.update(len(job.cases(tile)))
+        advance(tile)
 
-    try:
-        before: tuple[int, dict[str, Any]] | None = None
-        for tile in tiles:
-            running = job.start(tile)
-            if before is not None:
-                finish(*before)
-            before = tile, running
+    before: tuple[int, dict[str, Any]] | None = None
+    for tile in tiles:
+        running = job.start(tile)
         if before is not None:
             finish(*before)
-    finally:
-        if bar is not None:
-            bar.close()
+        before = tile, running
+    if before is not None:
+        finish(*before)
 
 
 def _batch(call: str, batch: int | None, cost: float, cases: int) -> int:
