@@ -244,8 +244,11 @@ def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
 def image(matrix: Any, x: Interval) -> Interval:
     """`linear_image` without its checks, for a stack of matrices (..., m, n) and boxes (n,) or (..., n)."""
     at_lower, at_upper = scale(matrix, x.lower[..., None, :]), scale(matrix, x.upper[..., None, :])
-    # A sum of products, not a dot: the batched dot of a tiny matrix is slow, and 0 * inf must not reach it.
-    return Interval.unchecked(jnp.minimum(at_lower, at_upper).sum(-1), jnp.maximum(at_lower, at_upper).sum(-1))
+    # A sum of products, not a dot: the batched dot of a tiny matrix is slow, and 0 * inf must not reach it. Sides are
+    # chosen by sign, not by min and max: those tie on boxes of width 0 and would halve the derivative of the width.
+    up = matrix >= 0
+    lower, upper = jnp.where(up, at_lower, at_upper), jnp.where(up, at_upper, at_lower)
+    return Interval.unchecked(lower.sum(-1), upper.sum(-1))
 
 
 def add(*boxes: Interval) -> Interval:
