@@ -82,6 +82,8 @@ def fold_rows(
 ) -> Any:
     """`fold` without its checks: everything in its final type and shape, rows behind `length` already missing."""
     recursion = estimation.recursion_of(observer)
+    # NumPy constants of an observer that is closed over may meet derivative rules that want arrays of JAX.
+    observer = jax.tree.map(jnp.asarray, observer)
     given = () if rows is None else (rows,)
     carry, out = recursion.begin(observer, initial, y[0], u[0], estimation.noise_at(noise, 0), hold)
     state = _like(state, update(state, out, jnp.int32(0), *jax.tree.map(lambda a: a[0], given)))
