@@ -61,7 +61,9 @@ class Allocation:
         lines.append(f"  {'state':<8}{'steady width':>14}{'required':>14}")
         for i, (width, wanted) in enumerate(zip(self.width, self.required, strict=True)):
             lines.append(f"  {'x' + str(i + 1):<8}{width:>14.6g}{wanted:>14.6g}")
-        return "\n".join([*lines, "  designed afresh for these bounds; the best of several starts, not a proven minimum"])
+        return "\n".join(
+            [*lines, "  designed afresh for these bounds; the best of several starts, not a proven minimum"]
+        )
 
 
 def allocate(
@@ -82,8 +84,9 @@ def allocate(
         noise: bounds to start from; those that are bought are scaled, the others stay.
         region: as in `design_observer`, a box.
         required: (n,) widths in units of the states, ``inf`` where nothing is required.
-        price: of a unit of precision, 2 / width of a bound: ``{"v": (l,), "w": (n,)}``; bounds of price 0, or left out, are
-            not for sale. Or a JAX function of `Noise`, decreasing in every width; then every bound of v is for sale.
+        price: of a unit of precision, 2 / width of a bound: ``{"v": (l,), "w": (n,)}``; bounds of price 0, or left
+            out, are not for sale. Or a JAX function of `Noise`, decreasing in every width; then all bounds of v are for
+            sale.
         limits: least and largest factor on a bound.
         u_region: as in `design_observer`.
         **design: for the fresh design, as in `design_observer`.
@@ -111,8 +114,8 @@ def allocate(
     width = np.asarray(observer.certificate.steady_width)
     if not ((width <= required).all() and observer.certificate.self_consistent):
         raise ValueError(
-            f"allocate: designed afresh, the bounds found give the widths {width} in place of {required}, or widths that "
-            "do not fit into the region; give a larger region, or one in better units"
+            f"allocate: designed afresh, the bounds found give the widths {width} in place of {required}, or widths "
+            "that do not fit into the region; give a larger region, or one in better units"
         )
     return Allocation(
         found, market.cost(best), market.cost(np.ones(market.count)), observer, width, required, np.array(history)
@@ -127,9 +130,9 @@ class _Market:
         boxes = noise.w, noise.v
         self.width = np.concatenate([np.asarray(box.width, float) for box in boxes])
         self.n, l = system.n, system.l
-        self.function = price if callable(price) else None
+        self.function: Callable[[Noise], Any] | None = None
         prices = np.zeros(self.n + l)
-        if self.function is None:
+        if isinstance(price, Mapping):
             for name, part, size in (("w", slice(0, self.n), self.n), ("v", slice(self.n, None), l)):
                 value = np.asarray(price.get(name, np.zeros(size)), float)
                 if value.shape != (size,) or not (np.isfinite(value) & (value >= 0)).all() or set(price) - {"w", "v"}:
@@ -140,6 +143,7 @@ class _Market:
                 prices[part] = value
             sale = prices > 0
         else:
+            self.function = price
             sale = np.arange(self.n + l) >= self.n
         self.index = np.flatnonzero(sale & (self.width > 0))
         self.count = len(self.index)
@@ -158,17 +162,12 @@ class _Market:
             raise NoDesignFound(f"allocate: the derivatives of f or g are not bounded on the region {region}")
         self.problem = Plan(system, noise, feedthrough, u_region).problem(slopes)
         check_rank(self.problem)
-        self.gradient = None if self.function is None else jax.value_and_grad(lambda s: self.function(self.noise(s)))
 
     def noise(self, factors: Any) -> Noise:
         """Bounds for factors (count,) on those that are for sale, scaled around the point nearest to 0."""
-        xp: Any = np if isinstance(factors, np.ndarray) else jax.numpy
-        scale = np.ones(len(self.width))
-        scale = np.copy(scale) if xp is np else jax.numpy.asarray(scale)
-        if xp is np:
-            scale[self.index] = factors
-        else:
-            scale = scale.at[self.index].set(factors)
+        spread = np.zeros((len(self.width), self.count))
+        spread[self.index, np.arange(self.count)] = 1
+        scale = (spread.sum(axis=1) == 0) + spread @ factors
         boxes = []
         for box, part in ((self.base.w, scale[: self.n]), (self.base.v, scale[self.n :])):
             lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
@@ -178,12 +177,14 @@ class _Market:
 
     def cost(self, factors: np.ndarray) -> float:
         if self.function is not None:
-            return float(self.function(self.noise(factors)))
+            return float(np.asarray(self.function(self.noise(factors))))
         return float((self.prices * 2 / (self.width[self.index] * factors)).sum())
 
     def cost_gradient(self, factors: np.ndarray) -> tuple[float, np.ndarray]:
-        if self.gradient is not None:
-            value, slope = self.gradient(jax.numpy.asarray(factors))
+        function = self.function
+        if function is not None:
+            price = jax.value_and_grad(lambda at: jax.numpy.asarray(function(self.noise(at))))
+            value, slope = price(jax.numpy.asarray(factors))
             return float(value), np.asarray(slope, float)
         each = self.prices * 2 / (self.width[self.index] * factors)
         return float(each.sum()), -each / factors

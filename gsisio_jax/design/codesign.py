@@ -1,7 +1,7 @@
 """Steady widths of the best gain as a differentiable function of the plant: design and gain at once.
 
-The gain solves a linear program at every point, and the derivative of its optimum needs no derivative of the gain. Row i
-of the best gain N minimises, at the steady width W,
+The gain solves a linear program at every point, and the derivative of its optimum needs no derivative of the gain. Row
+i of the best gain N minimises, at the steady width W,
 
     cost_i = sum_j |(P F - N_y E)_ij| W_j + |P|_ij (F_radius W + dw)_j + |N_y|_ij (E_radius W + dv)_j + |N_z|_ij (R W)_j
              + |N_z T2|_ij dv_j + ...,      P = I - N_z C,      subject to  N [H; C G] = G,
@@ -92,9 +92,13 @@ def optimal_widths(plant: Plant, theta: Any, u_region: Interval | None = None) -
     """
     try:
         system, noise, region = plant(theta)
-    except jax.errors.TracerArrayConversionError as error:
+    except ValueError as error:
+        if not isinstance(error.__cause__, TypeError):
+            raise
+        # NumPy was asked for the numbers of a traced array.
         raise ValueError(
-            "optimal_widths: a matrix or a bound of the system depends on `theta`; only f, g, the noise and the region may"
+            "optimal_widths: a matrix or a bound of the system depends on `theta`; only f, g, the noise and the region "
+            "may"
         ) from error
     if u_region is None:
         if system.takes_u:
@@ -106,7 +110,7 @@ def optimal_widths(plant: Plant, theta: Any, u_region: Interval | None = None) -
     def best(data: Enclosed, lower: Any, upper: Any) -> Optimum:
         return _optimum(_problem(system, T2, data), Interval(np.asarray(lower), np.asarray(upper)))
 
-    n, p = system.G.shape
+    n = system.n
     free = ~np.isfinite(np.asarray(system.input_bounds.width))
     shapes = {
         "N": (n, system.l + data.C.shape[0]), "W": (n,), "S1": (n, n), "S2": (n, n), "S3": (n, int((~free).sum())),
@@ -180,9 +184,11 @@ def _optimum(problem: GainProblem, region: Interval) -> Optimum:
     except NoDesignFound:
         N, W = np.zeros((n, problem.columns)), np.full(n, np.inf)
     if not np.isfinite(W).all():
-        return Optimum(N, np.full(n, np.inf), *(np.zeros((n, k)) for k in (n, n, b, f, n)))
+        none = np.zeros((n, n))
+        return Optimum(N, np.full(n, np.inf), none, none, np.zeros((n, b)), np.zeros((n, f)), none)
     inverse = np.linalg.inv(np.eye(n) - problem.growth(N) - problem.implicit(N))
-    return Optimum(N, W, *_multipliers(problem, W), inverse)
+    S1, S2, S3, Lambda = _multipliers(problem, W)
+    return Optimum(N, W, S1, S2, S3, Lambda, inverse)
 
 
 def _multipliers(problem: GainProblem, W: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -219,7 +225,9 @@ def _multipliers(problem: GainProblem, W: np.ndarray) -> tuple[np.ndarray, ...]:
     if equality is not None:
         constraints.append(equality)
     if not solve(cp.Problem(cp.Minimize(cost), constraints)):
-        raise ValueError("optimal_widths: the solver found no multipliers of the gain; choose other units of the states")
+        raise ValueError(
+            "optimal_widths: the solver found no multipliers of the gain; choose other units of the states"
+        )
     found = []
     for upper, lower, weight in pairs[:signs]:
         if upper is None:

@@ -42,8 +42,9 @@ def tune_noise(
     linear systems (f and g affine) the result is the optimum, with a proven lower bound. On others it is a local one,
     never worse than the smallest multiple of the start.
 
-    True bounds are never contradicted, so where they have the shape of the template the smallest multiple found does not
-    exceed them (beyond `tolerance`), and the optimum of a linear system costs no more than they do, whatever they are.
+    True bounds are never contradicted, so where they have the shape of the template the smallest multiple found does
+    not exceed them (beyond `tolerance`), and the optimum of a linear system costs no more than they do, whatever they
+    are.
 
     Args:
         observer: from `design_observer`; its gains stay as they are.
@@ -92,8 +93,9 @@ def tune_noise(
     vanished = bool((search.best <= search.floor).all())
     if evidence.weak and vanished:
         raise ValueError(
-            "tune_noise: noise bounds are not identifiable from these records: even a millionth of the bounds explains them, "
-            f"because {evidence.text}, and they never were. Log the true state (`x` of the records), or measure more."
+            "tune_noise: noise bounds are not identifiable from these records: even a millionth of the bounds explains "
+            f"them, because {evidence.text}, and they never were. Log the true state (`x` of the records), or measure "
+            "more."
         )
     if len(shape.names) > 1 and not vanished:
         chosen = method if method != "auto" else ("lp" if is_affine(observer) else "optax")

@@ -124,7 +124,7 @@ def fold_rows(
 
 
 def chunk_size(steps: int) -> int:
-    """Steps per chunk: the square root, so that as many chunk starts are kept as steps within a chunk; short records whole.
+    """Steps per chunk: the square root, so that as many chunk starts are kept as steps in a chunk; short records whole.
 
     >>> chunk_size(9_999), chunk_size(511)
     (100, 511)

@@ -3,8 +3,8 @@
 Bounds that are too small show in two ways only: a step finds an empty intersection (a conflict), or a logged truth lies
 outside its box. A conflict between measurements needs a combination of outputs that no unknown input reaches. The gain
 equation (design 4.1) has the rows [H; C G], as many as there are outputs; its rank is the number p of free inputs. With
-l > p some combination ``N_y y[k-1] + N_z z[k]`` is free of the input and of known size. With l = p there is none: the rows
-are square and invertible, so for every y some input explains the step, however small the noise bounds are.
+l > p some combination ``N_y y[k-1] + N_z z[k]`` is free of the input and of known size. With l = p there is none: the
+rows are square and invertible, so for every y some input explains the step, however small the noise bounds are.
 """
 
 from __future__ import annotations
@@ -44,7 +44,9 @@ def identify(call: str, system: System, truth: bool) -> Evidence:
     if outputs > free:
         spare = outputs - free
         what = f"{outputs} outputs for {free} free unknown inputs"
-        return Evidence(f"{what}: {spare} combination{'s' * (spare > 1)} of outputs per step can be contradicted", False)
+        return Evidence(
+            f"{what}: {spare} combination{'s' * (spare > 1)} of outputs per step can be contradicted", False
+        )
     if truth:
         return Evidence(f"{outputs} outputs for {free} free unknown inputs: the logged truth alone", False)
     if np.isfinite(np.asarray(system.state_bounds.width)).any():

@@ -57,9 +57,7 @@ def with_model(observer: Observer, system: System) -> Observer:
         whole = reach(old.state_bounds)
         weights = jnp.stack([jnp.abs(jnp.asarray(observer.gains.remainder[k])) for k in first.gains])
         inverses = jnp.linalg.inv(jnp.eye(n, dtype=whole.dtype) - weights @ whole)
-    changed = replace(
-        observer, system=system, first=FirstSweep(form, inverses, first.gains, affine_output)
-    )
+    changed = replace(observer, system=system, first=FirstSweep(form, inverses, first.gains, affine_output))
     if not certificate.promised:
         return changed
     slopes = inclusion.jacobian(system.maps)(certificate.region, u_region)

@@ -38,7 +38,7 @@ class Records:
     length: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        y = _pieces("y", self.y)
+        y = _pieces("y", self.y) if len(self.y) else []
         if not y:
             raise ValueError("Records: `y` holds no record; give at least one array (T, l)")
         length = np.array([len(piece) for piece in y])
@@ -48,7 +48,8 @@ class Records:
         initial = self.initial
         if not isinstance(initial, Interval) or len(initial.shape) not in (1, 2):
             raise ValueError(
-                f"Records: `initial` must be an Interval of shape (n,) or (R, n), got {getattr(initial, 'shape', initial)}"
+                "Records: `initial` must be an Interval of shape (n,) or (R, n), got "
+                f"{getattr(initial, 'shape', initial)}"
             )
         if len(initial.shape) == 2 and initial.shape[0] != len(y):
             raise ValueError(f"Records: `initial` has {initial.shape[0]} boxes for {len(y)} records of `y`")
@@ -146,9 +147,7 @@ class Records:
                     pieces.append(np.full((rows, size), np.nan) if part is None else part[r, :rows])
             return pieces
 
-        sides = (
-            np.concatenate([getattr(part.initial, side) for part in (self, other)]) for side in ("lower", "upper")
-        )
+        sides = (np.concatenate([getattr(part.initial, side) for part in (self, other)]) for side in ("lower", "upper"))
         return Records(Interval(*sides), both("y"), both("u"), both("x"), both("d"))
 
 

@@ -96,8 +96,9 @@ class TunedNoise:
         lines.append(f"  held out: {self.held_out}")
         lines.extend(f"  note: {note}" for note in self.notes)
         lines.append(
-            "  These bounds are evidence, not proof: the smallest of this shape that explain the fitted records. The true "
-            "noise\n  may be larger; a guarantee needs bounds from physics or data sheets, or a margin on top of these."
+            "  These bounds are evidence, not proof: the smallest of this shape that explain the fitted records. The "
+            "true noise\n  may be larger; a guarantee needs bounds from physics or data sheets, or a margin on top of "
+            "these."
         )
         return "\n".join(lines)
 

@@ -13,7 +13,7 @@ from gsisio_jax.interval import Interval
 from gsisio_jax.observer import Observer, cast
 from gsisio_jax.tuning.fold import fold_rows
 from gsisio_jax.tuning.records import Records
-from gsisio_jax.tuning.shape import Shape, Stretch
+from gsisio_jax.tuning.shape import Shape
 
 POINTS = 4  # noise bounds evaluated at once; fewer are filled up, so that every search runs the same program
 
@@ -82,23 +82,22 @@ def _slack(box: Interval, value: Any, room: Any) -> Any:
 
 
 @jax.jit
-def _values(observer: Observer, stretch: Stretch, factors: Any, records: Any, room: Any) -> Score:
-    def one(point: Any) -> Score:
-        noise = stretch.noise(point, observer.system.n)
+def _values(observer: Observer, noise: Any, records: Any, room: Any) -> Score:
+    def one(noise: Any) -> Score:
         return jax.vmap(lambda record: score_record(observer, noise, record, room))(records)
 
-    return jax.vmap(one)(factors)
+    return jax.vmap(one)(noise)
 
 
 @jax.jit
-def _gradients(observer: Observer, stretch: Stretch, factors: Any, records: Any, room: Any, mix: Any) -> Any:
+def _gradients(observer: Observer, noise: Any, records: Any, room: Any, mix: Any) -> Any:
     """Value and gradient, record by record, of the penalty (mix 1) or of the first violation (mix 0)."""
 
-    def one(point: Any, record: Any) -> Any:
-        score = score_record(observer, stretch.noise(point, observer.system.n), record, room)
+    def one(noise: Any, record: Any) -> Any:
+        score = score_record(observer, noise, record, room)
         return jnp.where(mix, score.penalty, jnp.where(jnp.isfinite(score.first), score.first, 0)), score
 
-    return jax.vmap(jax.value_and_grad(one, has_aux=True), in_axes=(None, 0))(factors, records)
+    return jax.vmap(jax.value_and_grad(one, has_aux=True), in_axes=(None, 0))(noise, records)
 
 
 class Scores:
@@ -116,8 +115,6 @@ class Scores:
         dtype = jax.dtypes.canonicalize_dtype(np.float64)
         self.shape, self.fitted, self.calls = shape, fitted, 0
         self._observer = observer if dtype == np.float64 else observer.astype(dtype)
-        self._stretch = Stretch(*(jnp.asarray(a, dtype if np.asarray(a).dtype.kind == "f" else None)
-                                  for a in shape.stretch))  # fmt: skip
         arrays = records.arrays(observer.system)
         length = arrays.pop("length")
         self._records = {**cast(arrays, dtype), "length": jnp.asarray(length)}
@@ -129,8 +126,9 @@ class Scores:
     def values(self, factors: np.ndarray) -> Score:
         """Scores of several factors (points, k), at most `POINTS`: arrays (points, R) over all records."""
         points = len(factors)
-        full = jnp.asarray(np.concatenate([factors, np.repeat(factors[-1:], POINTS - points, axis=0)]), self._dtype)
-        score = _values(self._observer, self._stretch, full, self._records, self._room)
+        full = np.concatenate([factors, np.repeat(factors[-1:], POINTS - points, axis=0)])
+        # The compiled programs know bounds, not factors: another parametrisation compiles nothing.
+        score = _values(self._observer, self.shape.noise(full).astype(self._dtype), self._records, self._room)
         self.calls += points
         return Score(*(np.asarray(a)[:points] for a in score))
 
@@ -140,9 +138,7 @@ class Scores:
 
     def gradient(self, factors: np.ndarray, penalty: bool) -> tuple[np.ndarray, np.ndarray, Score]:
         """Of the penalties, or of the first violations, of the fitted records: (R,), (R, k), and the scores."""
-        (value, score), slope = _gradients(
-            self._observer, self._stretch, jnp.asarray(factors, self._dtype), self._chosen, self._room,
-            jnp.asarray(penalty),
-        )  # fmt: skip
+        noise = self.shape.noise(factors).astype(self._dtype)
+        (value, score), slope = _gradients(self._observer, noise, self._chosen, self._room, jnp.asarray(penalty))
         self.calls += 1
-        return np.asarray(value), np.asarray(slope), Score(*map(np.asarray, score))
+        return np.asarray(value), self.shape.pull(slope), Score(*map(np.asarray, score))

@@ -1,8 +1,8 @@
 """The smallest factors that nothing contradicts: by bisection, by linear programs, by an exact penalty.
 
 What all three rest on: bounds that contain the true ones are never contradicted. So on a ray of growing bounds
-everything from some point on is feasible, and bisection that keeps "infeasible below, feasible above" ends below the true
-bounds, or within its tolerance of them, whatever happens further down.
+everything from some point on is feasible, and bisection that keeps "infeasible below, feasible above" ends below the
+true bounds, or within its tolerance of them, whatever happens further down.
 """
 
 from __future__ import annotations
@@ -55,9 +55,7 @@ class Search:
             bound = f", at least {self.lower:.6g}" if np.isfinite(self.lower) else ""
             self.progress(f"{len(self.history):4d}: cost {row['cost']:.6g}{bound}, tried {trial:.6g}")
 
-    def towards(
-        self, inside: np.ndarray, outside: np.ndarray, rounds: int
-    ) -> tuple[np.ndarray, np.ndarray | None]:
+    def towards(self, inside: np.ndarray, outside: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray | None]:
         """The last feasible point on the way from a feasible point to another one, and its infeasible neighbour.
 
         Every round looks at `POINTS` points; the neighbour is None where all of the way is feasible.
@@ -88,7 +86,7 @@ def common_factor(search: Search, start: np.ndarray, call: str) -> None:
     Raises:
         ValueError: no multiple explains the records.
     """
-    for exponent in range(0, 48, POINTS):
+    for exponent in range(0, 24, POINTS):
         multiples = 2.0 ** np.arange(exponent, exponent + POINTS)
         good = search.scores.feasible(multiples[:, None] * start)
         if good.any():
@@ -112,10 +110,10 @@ def common_factor(search: Search, start: np.ndarray, call: str) -> None:
 def linear_program(search: Search, rounds: int = 80) -> None:
     """The exact optimum on linear systems, by supporting hyperplanes.
 
-    With f and g affine and fixed gains every upper bound, and the negative of every lower bound, is a minimum of sums of
-    others with nonnegative weights: concave in the factors. So is the slack of every intersection, and its gradient at
-    an infeasible point is a cut that holds for all feasible factors. Every cut enters a linear program of k unknowns,
-    whose optimum is a lower bound; the way from there to a point inside gives a feasible point and the next cuts.
+    With f and g affine and fixed gains every upper bound, and the negative of every lower bound, is a minimum of sums
+    of others with nonnegative weights: concave in the factors. So is the slack of every intersection, and its gradient
+    at an infeasible point is a cut that holds for all feasible factors. Every cut enters a linear program of k
+    unknowns, whose optimum is a lower bound; the way from there to a point inside gives a feasible point and the next cuts.
 
     Raises:
         MissingExtra: SciPy is not installed.

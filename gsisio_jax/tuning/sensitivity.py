@@ -1,4 +1,4 @@
-"""`width_sensitivity`: which bound, which initial knowledge, which model parameter moves the widths, and by how much."""
+"""`width_sensitivity`: which noise bound, initial bound or model parameter moves the widths, and by how much."""
 
 from __future__ import annotations
 
@@ -70,7 +70,9 @@ def width_sensitivity(
     if (model is None) != (theta is None):
         raise ValueError("width_sensitivity: `model` and `theta` belong together; give both or none")
     call = "width_sensitivity"
-    initial, y, u, bounds, observer = estimation._prepare(call, observer, initial, y, u, noise, rows=True)
+    initial, y, u, bounds, typed = estimation._prepare(call, observer, initial, y, u, noise, rows=True)
+    assert isinstance(typed, Observer)
+    observer = typed
     if any(len(box.shape) != 1 for box in (bounds.w, bounds.v)):
         raise ValueError("width_sensitivity: `noise` must be constant, of shapes (n,) and (l,); it changes with time")
     system = observer.system
@@ -154,7 +156,9 @@ def _certificate(observer: Observer, noise: Noise, model: Any, parameters: Any, 
         # The gain re-optimised: at the best gain terms cancel exactly, and a fixed one has a kink there.
         region = certificate.region
         u_region = observer.u_region if system.takes_u else None
-        best = jax.jit(jax.jacrev(lambda q: optimal_widths(lambda at: (model(rebuild(at)), noise, region), q, u_region)))
+        best = jax.jit(
+            jax.jacrev(lambda q: optimal_widths(lambda at: (model(rebuild(at)), noise, region), q, u_region))
+        )
         slope[:n, n + l + n :] = np.asarray(best(parameters))
     return width, slope
 

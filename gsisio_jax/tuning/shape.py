@@ -1,16 +1,15 @@
 """Which numbers are fitted: from a few factors to noise bounds.
 
-Every bound is that of a template, stretched away from its anchor, the point of the template nearest to 0. So bounds grow
-with every factor, and boxes of larger factors contain those of smaller ones.
+Every bound is that of a template, stretched away from its anchor, the point of the template nearest to 0. So bounds
+grow with every factor, and boxes of larger factors contain those of smaller ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval import Interval
@@ -19,47 +18,44 @@ from gsisio_jax.system import Noise
 Parameters = str | Mapping[str, Any]
 
 
-class Stretch(NamedTuple):
-    """The arrays of a `Shape`, for compiled programs: noise = anchor -+ factor[index] reach, w first, then v."""
-
-    anchor: Any
-    reach_lower: Any
-    reach_upper: Any
-    index_lower: Any
-    index_upper: Any
-
-    def noise(self, factors: Any, states: int) -> Noise:
-        """Bounds for factors (k,); differentiable. Sides that are not fitted have the last index, for factor 1."""
-        factors = jnp.concatenate([factors, jnp.ones(1, factors.dtype)])
-        lower = self.anchor - factors[self.index_lower] * self.reach_lower
-        upper = self.anchor + factors[self.index_upper] * self.reach_upper
-        return Noise.unchecked(*(Interval.unchecked(lower[part], upper[part]) for part in _parts(states)))
-
-
 @dataclass(frozen=True)
 class Shape:
-    """A template of noise bounds and the factors that stretch it."""
+    """A template of noise bounds and the factors that stretch it: bounds = anchor -+ factor[index] reach, w then v.
+
+    Attributes:
+        template: the bounds for factors 1.
+        names: of the k factors.
+        anchor: (n + l,).
+        reach: below and above the anchor, two arrays (n + l,).
+        index: of the factor of each side, two arrays (n + l,); k, for factor 1, where a side is not fitted.
+    """
 
     template: Noise
     names: tuple[str, ...]
-    stretch: Stretch
-
-    @property
-    def states(self) -> int:
-        """Number of components of w."""
-        return self.template.w.shape[0]
+    anchor: np.ndarray
+    reach: tuple[np.ndarray, np.ndarray]
+    index: tuple[np.ndarray, np.ndarray]
 
     def noise(self, factors: np.ndarray) -> Noise:
-        """Noise bounds for factors (k,), as NumPy arrays."""
-        bounds = self.stretch.noise(jnp.asarray(factors, float), self.states)
-        return Noise(*(Interval(np.asarray(box.lower), np.asarray(box.upper)) for box in (bounds.w, bounds.v)))
+        """Noise bounds for factors (..., k), as NumPy arrays (..., n) and (..., l)."""
+        factors = np.concatenate([factors, np.ones((*np.shape(factors)[:-1], 1))], axis=-1)
+        lower = self.anchor - factors[..., self.index[0]] * self.reach[0]
+        upper = self.anchor + factors[..., self.index[1]] * self.reach[1]
+        n = self.template.w.shape[0]
+        return Noise(Interval(lower[..., :n], upper[..., :n]), Interval(lower[..., n:], upper[..., n:]))
+
+    def pull(self, slope: Noise) -> np.ndarray:
+        """From derivatives by the bounds (R, .) to derivatives by the factors, (R, k)."""
+        total = np.zeros((np.shape(slope.w.lower)[0], len(self.names) + 1))
+        for side, name, sign in ((0, "lower", -1.0), (1, "upper", 1.0)):
+            by_side = np.concatenate([np.asarray(getattr(box, name)) for box in (slope.w, slope.v)], axis=1)
+            np.add.at(total.T, self.index[side], sign * (by_side * self.reach[side]).T)
+        return total[:, :-1]
 
     def cost(self, weights: np.ndarray) -> tuple[np.ndarray, float]:
         """The weighted sum of widths as ``vector @ factors + constant``; weights (n + l,)."""
         total = np.zeros(len(self.names) + 1)
-        for index, reach in (
-            (self.stretch.index_lower, self.stretch.reach_lower), (self.stretch.index_upper, self.stretch.reach_upper),
-        ):  # fmt: skip
+        for index, reach in zip(self.index, self.reach, strict=True):
             np.add.at(total, index, weights * reach)
         return total[:-1], float(total[-1])
 
@@ -67,11 +63,9 @@ class Shape:
         """The smallest factors whose bounds contain the given ones; sides that are not fitted do not count."""
         found = np.zeros(len(self.names) + 1)
         sides = [np.concatenate([np.asarray(getattr(b, s), float) for b in (noise.w, noise.v)]) for s in _SIDES]
-        s = self.stretch
-        for index, reach, needed in (
-            (s.index_lower, s.reach_lower, s.anchor - sides[0]), (s.index_upper, s.reach_upper, sides[1] - s.anchor),
-        ):  # fmt: skip
-            np.maximum.at(found, index, np.where(reach > 0, needed / np.where(reach > 0, reach, 1), 0))
+        needed = self.anchor - sides[0], sides[1] - self.anchor
+        for index, reach, side in zip(self.index, self.reach, needed, strict=True):
+            np.maximum.at(found, index, np.where(reach > 0, side / np.where(reach > 0, reach, 1), 0))
         return found[:-1]
 
 
@@ -94,7 +88,9 @@ def read_shape(call: str, template: Noise, parameters: Parameters) -> Shape:
     sizes = [box.shape[-1] for box in (template.w, template.v)]
     if any(len(box.shape) != 1 for box in (template.w, template.v)):
         raise ValueError(f"{call}: the noise to fit must be constant, of shapes (n,) and (l,); it changes with time")
-    lower, upper = (np.concatenate([np.asarray(getattr(b, s), float) for b in (template.w, template.v)]) for s in _SIDES)
+    lower, upper = (
+        np.concatenate([np.asarray(getattr(b, s), float) for b in (template.w, template.v)]) for s in _SIDES
+    )
     anchor = np.clip(0.0, lower, upper)
     reach = anchor - lower, upper - anchor
     labels = _labels(call, sizes, parameters)
@@ -116,7 +112,7 @@ def read_shape(call: str, template: Noise, parameters: Parameters) -> Shape:
     rank = np.argsort(order)
     fixed = len(names)
     index = [np.where(chosen < 0, fixed, rank[np.maximum(chosen, 0)]) for chosen in index]
-    return Shape(template, tuple(names[j] for j in order), Stretch(anchor, *reach, *index))
+    return Shape(template, tuple(names[j] for j in order), anchor, reach, (index[0], index[1]))
 
 
 def _labels(call: str, sizes: list[int], parameters: Parameters) -> list[str | None]:
@@ -145,7 +141,3 @@ def _labels(call: str, sizes: list[int], parameters: Parameters) -> list[str | N
 def _first_use(name: int, index: Sequence[np.ndarray]) -> tuple[int, int]:
     """Where a factor appears first: by component, then by side."""
     return min((int(i), side) for side, chosen in enumerate(index) for i in np.flatnonzero(chosen == name))
-
-
-def _parts(states: int) -> tuple[slice, slice]:
-    return slice(None, states), slice(states, None)

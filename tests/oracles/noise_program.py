@@ -1,10 +1,10 @@
 """Independent truth for fitted noise bounds on a linear plant: the whole box recursion as ONE linear program.
 
-For ``x+ = A x + G d + w``, ``y = x + v`` (all states measured, H = 0) and gains taken as given, every upper bound of the
-recursion is at most a sum, with nonnegative weights, of upper bounds, negated lower bounds and noise bounds. So the upper
-and lower bounds of all steps become unknowns, every intersection an inequality per member, and "no conflict" reads
-lower <= upper. Where such unknowns exist the recursion itself, whose upper bounds are the largest that the inequalities
-allow, has no conflict either; so the cheapest noise bounds are the optimum of this program.
+For ``x+ = A x + G d + w``, ``y = x + v`` (all states measured, H = 0) and gains taken as given, every upper bound of
+the recursion is at most a sum, with nonnegative weights, of upper bounds, negated lower bounds and noise bounds. So the
+upper and lower bounds of all steps become unknowns, every intersection an inequality per member, and "no conflict"
+reads lower <= upper. Where such unknowns exist the recursion itself, whose upper bounds are the largest that the
+inequalities allow, has no conflict either; so the cheapest noise bounds are the optimum of this program.
 
 Nothing here shares code with the package: expressions are dictionaries of coefficients, solved by SciPy's HiGHS.
 """
