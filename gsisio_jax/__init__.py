@@ -15,9 +15,10 @@ from gsisio_jax.status import Status
 from gsisio_jax.system import Noise, System
 
 if TYPE_CHECKING:
-    from gsisio_jax import dataset, examples, paper, plot, study
+    from gsisio_jax import dataset, examples, paper, plot, study, tuning
     from gsisio_jax.design import design_observer
     from gsisio_jax.study import grid, monte_carlo, sweep
+    from gsisio_jax.tuning import allocate, tune_noise, width_sensitivity
 
 __version__ = "0.1.0"
 
@@ -38,6 +39,7 @@ __all__ = [
     "Status",
     "StepOutput",
     "System",
+    "allocate",
     "dataset",
     "design_observer",
     "estimate",
@@ -56,18 +58,25 @@ __all__ = [
     "step",
     "study",
     "sweep",
+    "tune_noise",
+    "tuning",
+    "width_sensitivity",
 ]
 
 _LAZY = {
+    "allocate": "gsisio_jax.tuning",
     "design_observer": "gsisio_jax.design",
     "grid": "gsisio_jax.study",
     "monte_carlo": "gsisio_jax.study",
     "sweep": "gsisio_jax.study",
+    "tune_noise": "gsisio_jax.tuning",
+    "width_sensitivity": "gsisio_jax.tuning",
     "dataset": "",
     "examples": "",
     "paper": "",
     "plot": "",
     "study": "",
+    "tuning": "",
 }
 
 

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.node import Node, best_form, product, shift, stretch
-from gsisio_jax.interval import Interval, choose, entire_like
+from gsisio_jax.interval import Interval, choose, entire_like, larger, smaller
 
 INF = math.inf
 # Below this relative width a secant is mostly rounding; the tangent at the middle is as good there.
@@ -49,7 +49,7 @@ def extremes(values: list[Any]) -> Interval:
     """Smallest and largest of several arrays."""
     lower = upper = values[0]
     for value in values[1:]:
-        lower, upper = jnp.minimum(lower, value), jnp.maximum(upper, value)
+        lower, upper = smaller(lower, value), larger(upper, value)
     return Interval.unchecked(lower, upper)
 
 

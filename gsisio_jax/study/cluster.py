@@ -8,24 +8,16 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
-import platform
-import threading
 import time
 import uuid
 import warnings
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
-import numpy as np
-
-import gsisio_jax
 from gsisio_jax._extras import need
+from gsisio_jax.study.parcel import Parcel, compute_tile
 
 if TYPE_CHECKING:
     from gsisio_jax.study.job import Job, Results
@@ -35,112 +27,6 @@ PER_WORKER = 2  # tiles in flight: one that runs and one that is ready to
 LOSSES = 3  # times that a tile may be lost
 ALONE = 60.0  # seconds without any worker before it is said
 SEEN = 90.0  # seconds that a file of another machine may take to be seen; NFS keeps its folders for 60
-POOL = ("PJRT_NPROC", "NPROC")  # what XLA takes the number of its threads from, where one of them is set
-
-_one_tile = threading.Lock()
-
-
-class Setting(NamedTuple):
-    """What the numbers depend on besides the job: versions, and configuration of JAX that is not part of any array."""
-
-    python: str
-    jax: str
-    gsisio_jax: str
-    x64: bool
-    threefry_partitionable: bool
-    matmul_precision: str | None
-
-    @classmethod
-    def here(cls) -> Setting:
-        """That of this process and thread."""
-        return cls(
-            ".".join(platform.python_version_tuple()[:2]),
-            jax.__version__,
-            gsisio_jax.__version__,
-            jax.dtypes.canonicalize_dtype(np.float64) == np.float64,
-            *(getattr(jax.config, f"jax_{name}") for name in ("threefry_partitionable", "default_matmul_precision")),
-        )
-
-    @contextlib.contextmanager
-    def applied(self, call: str) -> Iterator[None]:
-        """Compute as the process does that made this; the configuration of this process is left alone.
-
-        Raises:
-            ValueError: the versions differ.
-        """
-        here = Setting.here()
-        differ = [f"{name} {there} ({now} here)" for name, now, there in zip(self._fields, self, here, strict=True)]
-        differ = [text for text, now, there in zip(differ[:3], self, here, strict=False) if now != there]
-        if differ:
-            raise ValueError(
-                f"{call}: a worker on {platform.node()} has {', '.join(differ)}, so its numbers could differ; install "
-                "the same versions on the workers"
-            )
-        with (
-            jax.enable_x64(self.x64),
-            jax.threefry_partitionable(self.threefry_partitionable),
-            jax.default_matmul_precision(self.matmul_precision),
-        ):
-            yield
-
-
-@dataclass(eq=False)
-class Parcel:
-    """What a worker is sent, once.
-
-    Attributes:
-        rest: the job without what is in `program`.
-        program: observer, rows and reductions, pickled: they hold the user's functions, and arrays of JAX, which must
-            be unpacked in the precision of the sender.
-        setting: of the sender.
-        store: where finished tiles go; None: back.
-    """
-
-    rest: Job
-    program: bytes
-    setting: Setting
-    store: TileStore | None
-
-    @classmethod
-    def of(cls, job: Job, store: TileStore | None) -> Parcel:
-        """Pack a job.
-
-        Raises:
-            ValueError: a function of the user cannot be sent.
-        """
-        pickle = need("cloudpickle", extra="cluster", purpose="`client`")
-        try:
-            program = pickle.dumps((job.observer, job.rows, job.reductions))
-        except Exception as error:
-            raise ValueError(
-                f"{job.call}: the observer cannot be sent to workers: {error}; f, g and functions of the study must "
-                "not hold on to open files, locks and the like"
-            ) from error
-        rest: Any = {"observer": None, "rows": None, "reductions": ()}
-        return cls(replace(job, **rest), program, Setting.here(), store)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "job"}
-
-    @cached_property
-    def job(self) -> Job:
-        """The job, unpacked once in every process."""
-        try:
-            observer, rows, reductions = _unpacked(self.program, self.setting.x64)
-        except (ImportError, AttributeError) as error:
-            raise ValueError(
-                f"{self.rest.call}: a worker cannot load the functions of the study: {error}; send their module with "
-                "client.upload_file('plant.py') or install it on the workers, or define f and g in the script itself"
-            ) from error
-        return replace(self.rest, observer=observer, rows=rows, reductions=reductions)
-
-
-@lru_cache(maxsize=8)
-def _unpacked(program: bytes, x64: bool) -> Any:
-    """f and g of equal bytes are the same objects, so that later studies of an observer find it compiled."""
-    return need("cloudpickle", extra="cluster", purpose="a worker").loads(program)
-
-
 def check(call: str, client: Any) -> None:
     """Refuse what is no client of a cluster that runs.
 
@@ -192,7 +78,7 @@ def compute(
                 key = f"{job.call}-{uuid.uuid4().hex}-{tile}"
                 # Should the worker die, any other will do.
                 where = {} if worker is None else {"workers": [worker], "allow_other_workers": True}
-                running[client.submit(_tile, sent, tile, key=key, pure=False, **where)] = _Running(tile, worker)
+                running[client.submit(compute_tile, sent, tile, key=key, pure=False, **where)] = _Running(tile, worker)
             for future in _ended(client, job.call, running):
                 tile, _ = running.pop(future)
                 try:
@@ -211,7 +97,7 @@ def compute(
                     keep(tile, results)
                 advance(tile)
     except (OSError, RuntimeError) as error:
-        if client.status == "running" and not isinstance(error, distributed.CommClosedError):
+        if client.status == "running" and not isinstance(error, distributed.comm.CommClosedError):
             raise
         raise ValueError(f"{job.call}: the cluster is gone ({client.status}): {error}{kept}") from error
     finally:
@@ -309,33 +195,3 @@ def _await_files(call: str, store: TileStore, tiles: Sequence[int]) -> None:
                 "machine; give a `store` in a folder that all machines share"
             )
         time.sleep(0.5)
-
-
-def _tile(parcel: Parcel, tile: int) -> Results | None:
-    """The task: one tile, on a worker."""
-    with _one_tile:
-        _limit_threads()
-        with parcel.setting.applied(parcel.rest.call):
-            job = parcel.job
-            results = job.finish(tile, job.start(tile))
-    if parcel.store is None:
-        return results
-    parcel.store.write(tile, results)
-    return None
-
-
-@cache
-def _limit_threads() -> None:
-    """Let XLA make as many threads as Dask gave this worker, before it makes any; otherwise every worker would take all
-    cores of the machine. Nothing happens where it has made them already, or where the environment says how many."""
-    distributed = need("distributed", extra="cluster", purpose="a worker")
-    system = need("dask.system", extra="cluster", purpose="a worker")
-    if any(name in os.environ for name in POOL):
-        return
-    threads = str(min(distributed.get_worker().state.nthreads, system.CPU_COUNT))
-    os.environ.update(dict.fromkeys(POOL, threads))
-    try:
-        jax.devices()
-    finally:
-        for name in POOL:
-            del os.environ[name]

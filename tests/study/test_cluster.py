@@ -25,8 +25,8 @@ from study import cluster_faults as faults
 import gsisio_jax as gx
 from gsisio_jax.errors import ContainmentLost
 from gsisio_jax.study import cluster as cluster_module
-from gsisio_jax.study.cluster import Parcel, Setting
 from gsisio_jax.study.job import Job
+from gsisio_jax.study.parcel import Parcel, Setting
 from gsisio_jax.study.store import TileStore
 
 dask = pytest.importorskip("dask")
@@ -170,6 +170,18 @@ def test_a_cluster_that_is_gone(study, monkeypatch, tmp_path):
             gx.sweep(**study, client=client, store=tmp_path / "store")
         with pytest.raises(ValueError, match=r"^sweep: `client` is not connected \(\w+\); make a new one"):
             gx.sweep(**study, client=client)
+
+
+def test_a_connection_that_breaks_is_named(study, monkeypatch):
+    """Before the client itself has noticed."""
+
+    def broken() -> Any:
+        raise distributed.comm.CommClosedError("in <TCP>: Stream is closed")
+
+    monkeypatch.setattr(cluster_module, "_send", lambda *_: None)
+    monkeypatch.setattr(cluster_module, "check", lambda *_: None)
+    with pytest.raises(ValueError, match=r"^sweep: the cluster is gone \(running\): in <TCP>: Stream is closed$"):
+        gx.sweep(**study, client=SimpleNamespace(status="running", nthreads=broken))
 
 
 def test_workers_that_cannot_begin(monkeypatch):
