@@ -19,10 +19,11 @@ SIZES = {  # full, quick
     "numpy": ({"batch": 2_000, "steps": 100}, {"batch": 1_000, "steps": 20}),
     "tanks": ({"steps": 100}, {"steps": 50}),
     "study": ({"boxes": 1000, "levels": 1000, "steps": 100}, {"boxes": 100, "levels": 100, "steps": 50}),
+    "rounding": ({"batch": 20_000, "steps": 100}, {"batch": 2_000, "steps": 50}),
 }
 
 
-def cases(quick: bool) -> dict[str, tuple[str, str, dict[str, int]]]:
+def cases(quick: bool) -> dict[str, tuple[str, str, dict[str, Any]]]:
     """Name of every case: its module, its function and its arguments."""
     size = {name: both[quick] for name, both in SIZES.items()}
     return {
@@ -30,6 +31,11 @@ def cases(quick: bool) -> dict[str, tuple[str, str, dict[str, int]]]:
         "throughput all boxes": ("throughput", "all_boxes", size["compiled"]),
         "throughput NumPy": ("throughput", "numpy", size["numpy"]),
         "study sweep": ("studies", "sweep", size["study"]),
+        **{
+            f"rounding {plant} {dtype}": ("rounding", "compare", {"plant": plant, "dtype": dtype, **size["rounding"]})
+            for plant in ("s1", "s5")
+            for dtype in ("float64", "float32")
+        },
         "startup import": ("startup", "importing", {}),
         "startup six tanks": ("startup", "tanks", size["tanks"]),
     }
@@ -58,7 +64,7 @@ def main() -> int:
     return 0 if all(result["ok"] for result in results.values()) else 1
 
 
-def run_here(module: str, function: str, arguments: dict[str, int]) -> dict[str, Any]:
+def run_here(module: str, function: str, arguments: dict[str, Any]) -> dict[str, Any]:
     """Run one case in this process."""
     import importlib
 
@@ -119,6 +125,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         notes = [r.get("error") or ("passed" if r["ok"] else "FAILED")]
         notes += [f"agrees to {r['gap']:.0e}"] if "gap" in r else []
         notes += [f"{r['to_bare']:.2f} of the rate of the bare kernel"] if "to_bare" in r else []
+        notes += [f"outward / nearest {r['cost']:.2f}, wider by {r['inflation']:.1e}"] if "cost" in r else []
         notes += [f"design {r['design_seconds']:.1f} s"] if "design_seconds" in r else []
         left = f"{name:<26}{size:>16}{run:>10}{cpu:>10}{build:>10}{rate:>14}"
         lines.append(f"{left}{ratio:>9}{peak:>11}  {', '.join(notes)}")

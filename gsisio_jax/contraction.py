@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax import rounding
 from gsisio_jax.inclusion import AffineForm
-from gsisio_jax.interval import Interval, add, image, intersect, scale
+from gsisio_jax.interval import Interval, add, image, intersect, products, reach, scale, spread, widen
 from gsisio_jax.status import SOURCE_STRIDE, Source
 
 _SMALLEST_SLOPE = 1e-9  # share of a strip's largest slope below which dividing by it can only widen
@@ -42,9 +43,10 @@ class Evidence(eqx.Module):
         codes = tuple(int(kind) * SOURCE_STRIDE + i for i in range(slack.shape[0]))
         if not codes:
             return self
-        # Boxes that only touch (noise on its bound, zero noise) may miss each other by rounding: that is no conflict.
-        rounding = _ROUNDING * jnp.finfo(slack.dtype).eps * self.scale
-        slack = jnp.where((slack < 0) & (slack >= -rounding), 0, slack)
+        # The boxes are rounded outward, so a gap is real. But the record may itself hold rounded numbers (noise on its
+        # bound, zero noise), which miss the plant by as much: that is no conflict.
+        tolerance = _ROUNDING * jnp.finfo(slack.dtype).eps * self.scale
+        slack = jnp.where((slack < 0) & (slack >= -tolerance), 0, slack)
         return Evidence(self.box, self.scale, (*self.slacks, slack), (*self.sources, codes))
 
     def meet(self, others: Interval, kind: Source, by_row: bool = False) -> Evidence:
@@ -130,19 +132,44 @@ class Bank(eqx.Module):
     def explicit(self, h: AffineForm, x_before: Interval, terms: Terms) -> Interval:
         """All terms but those in x[k]: box (K, r). Slopes are combined before the box is applied, so that what
         cancels cancels exactly; that is what keeps widths finite on nonlinear systems (design 4.3, step 2)."""
-        slope = (self.residual[..., None] * h.slope).sum(-2)
-        joint = add(image(slope, x_before), image(self.residual, h.offset))
+        parts = self.residual[..., None] * h.slope
+        slope = parts.sum(-2)
+        low, high = products(slope, x_before)
+        offset_low, offset_high = products(self.residual, h.offset)
+        joint = Interval.unchecked(low.sum(-1) + offset_low.sum(-1), high.sum(-1) + offset_high.sum(-1))
+        if rounding.outward():
+            # Of the slopes before they cancelled.
+            lost = scale(abs(parts).sum(-2), reach(x_before)[..., None, :]).sum(-1)
+            n = 1.0 * sum(h.slope.shape) + 8
+            joint = Interval.unchecked(
+                rounding.unbounded(rounding.lowered(joint.lower, lost + abs(offset_low).sum(-1), n, n), -jnp.inf),
+                rounding.unbounded(rounding.raised(joint.upper, lost + abs(offset_high).sum(-1), n, n), jnp.inf),
+            )
         box = intersect(joint, image(self.residual, h.range))[0]
         return add(box, self.linear(terms))
 
     def linear(self, terms: Terms) -> Interval:
         """The terms that are linear in boxes known beforehand: noise, measurements, state and input bounds."""
-        return add(
-            image(self.residual, terms.shift),
-            image(self.output, terms.output),
-            image(self.bounds, terms.bounds),
-            image(self.known, terms.known),
-        )
+        weights = jnp.concatenate([self.residual, self.output, self.bounds, self.known], -1)
+        boxes = (terms.shift, terms.output, terms.bounds, terms.known)
+        known = Interval.unchecked(*(jnp.concatenate(sides) for sides in zip(*map(_sides, boxes), strict=True)))
+        return image(weights, known)
+
+
+class Slips(eqx.Module):
+    """Upper bounds of what the bounds of a `Bank` leave, by rounding, of what they do not know.
+
+    Attributes:
+        x: (K, r, n), of x[k].
+        d: (K, r, p), of d[k-1].
+    """
+
+    x: Any
+    d: Any
+
+    def radius(self, x: Any, d: Any) -> Any:
+        """How far a bound can be off, (K, r), where ``|x[k]| <= x`` and ``|d[k-1]| <= d``."""
+        return rounding.up(spread(self.x, x) + spread(self.d, d))
 
 
 class Terms(eqx.Module):
@@ -174,35 +201,40 @@ def strips(evidence: Evidence, form: AffineForm, z: Interval) -> Evidence:
     box, slope, offset = evidence.box, form.slope, form.offset
     if not slope.shape[0]:
         return evidence  # d reaches every output: none of them is free of it
-    at_lower, at_upper = scale(slope, box.lower), scale(slope, box.upper)
-    low, high = jnp.minimum(at_lower, at_upper), jnp.maximum(at_lower, at_upper)  # (q, n)
-    reach = intersect(Interval.unchecked(low.sum(-1) + offset.lower, high.sum(-1) + offset.upper), form.range)[0]
-    evidence = evidence.weigh(intersect(reach, z)[1], Source.OUTPUT)
+    low, high = products(slope, box)  # (q, n)
+    reached = add(Interval.unchecked(rounding.sum_down(low), rounding.sum_up(high)), offset)
+    evidence = evidence.weigh(intersect(intersect(reached, form.range)[0], z)[1], Source.OUTPUT)
     # Sums over the other states as masked sums: total minus own term would be inf - inf.
     others = ~jnp.eye(box.shape[0], dtype=bool)
-    rest_low = jnp.where(others, low[:, None, :], 0).sum(-1)
-    rest_high = jnp.where(others, high[:, None, :], 0).sum(-1)
+    rest_low = rounding.sum_down(jnp.where(others, low[:, None, :], 0))
+    rest_high = rounding.sum_up(jnp.where(others, high[:, None, :], 0))
+    free = add(z, Interval.unchecked(-offset.upper, -offset.lower))
+    own = add(Interval.unchecked(free.lower[:, None], free.upper[:, None]), Interval.unchecked(-rest_high, -rest_low))
     usable = jnp.abs(slope) > _SMALLEST_SLOPE * jnp.max(jnp.abs(slope), axis=-1, keepdims=True)
     inverse = jnp.where(usable, 1 / jnp.where(usable, slope, 1), 0)
-    a = scale(inverse, (z.lower - offset.upper)[:, None] - rest_high)
-    b = scale(inverse, (z.upper - offset.lower)[:, None] - rest_low)
+    a, b = scale(inverse, own.lower), scale(inverse, own.upper)
     solved = Interval.unchecked(
-        jnp.where(usable, jnp.minimum(a, b), -jnp.inf), jnp.where(usable, jnp.maximum(a, b), jnp.inf)
+        jnp.where(usable, rounding.down(jnp.minimum(a, b), 4.0), -jnp.inf),
+        jnp.where(usable, rounding.up(jnp.maximum(a, b), 4.0), jnp.inf),
     )
     return evidence.meet(solved, Source.OUTPUT, by_row=True)
 
 
-def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any) -> Interval:
+def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box: Interval) -> Interval:
     """Solve ``x + N_z psi(x) in right`` for x, for every gain.
 
-    On the box ``psi(x) = (S - C) x + [e]``, so ``(I + N_z (S - C)) x in right - N_z [e]``: one plain linear solve, by
-    the matrix inversion lemma with a q x q inverse. Where that inverse does not verify the contraction is skipped.
+    On the box ``psi(x) = (S - C) x + [e]``, so ``A x in right - N_z [e]`` with ``A = I + N_z (S - C)``: one plain
+    linear solve, by the matrix inversion lemma with a q x q inverse. Where that inverse does not verify the
+    contraction is skipped. For any matrix M, ``x = M (A x) + (I - M A) x``: with ``D = S - C``, B the computed inverse
+    of ``I + D N_z`` and ``M = I - N_z B D``, ``I - M A = N_z (B (I + D N_z) - I) D``, which counts with the reach of
+    the box, as does the rounding of M and D.
 
     Args:
         gains: K gains.
         right: box (K, n) of the right side without its psi term.
         form: affine bounds ``S x + [e]`` of T2 g on the current box.
         C: slopes the design chose (q, n).
+        box: box (n,) that x is known to lie in.
 
     Returns:
         Box (K, n) of x[k] for every gain.
@@ -212,10 +244,24 @@ def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any) -> I
     N_z = gains.remainder
     difference = form.slope - C  # (q, n)
     small = jnp.eye(C.shape[0], dtype=difference.dtype) + _product(difference, N_z)
-    inverse, verified = _verified_inverse(small)
-    correction = _product(N_z, _product(inverse, difference))  # N_z (I + (S-C) N_z)^-1 (S-C)
+    inverse, defect, verified = _verified_inverse(small)
+    through = _product(inverse, difference)
+    correction = _product(N_z, through)  # N_z (I + (S-C) N_z)^-1 (S-C)
     shifted = add(right, image(-N_z, form.offset))
     solved = image(jnp.eye(C.shape[1], dtype=difference.dtype) - correction, shifted)
+    if rounding.outward():
+        far = reach(box)
+        D, N, B = abs(difference), abs(N_z), abs(inverse)
+        size, n = sum(C.shape) + 4.0, C.shape[1] + 2.0 * C.shape[0]
+        # Residual of B, with what its own evaluation loses, and that of D: |D| far is at hand as a vector.
+        thrown = spread(D, far)
+        of_inverse = defect + rounding.error(_product(B, jnp.eye(C.shape[0], dtype=D.dtype) + _product(D, N)), size)
+        radius = spread(N, spread(of_inverse, thrown))
+        # Rounding of M = I - N_z B D, which meets A x, and of D in both: (I + |N||B||D|) (far + |N||D| far).
+        image_of_x = far + spread(N, thrown)
+        touched = image_of_x + spread(N, spread(B, spread(D, image_of_x)))
+        radius = rounding.unbounded(rounding.up(radius + rounding.error(touched, 2 * n)), jnp.inf)
+        solved = widen(solved, radius)
     keep = verified[:, None]
     return Interval.unchecked(jnp.where(keep, solved.lower, -jnp.inf), jnp.where(keep, solved.upper, jnp.inf))
 
@@ -225,9 +271,10 @@ def _product(a: Any, b: Any) -> Any:
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
 
 
-def _verified_inverse(matrix: Any) -> tuple[Any, Any]:
-    """Inverse of a stack (K, q, q) of matrices near the identity, by elimination without LAPACK, and whether it
-    verifies. A small pivot gives a wrong inverse, which the residual reveals; it is never trusted unverified."""
+def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
+    """Inverse of a stack (K, q, q) of matrices near the identity, by elimination without LAPACK, what its product
+    with the matrix misses of the identity (magnitudes, as evaluated), and whether it verifies. A small pivot gives a
+    wrong inverse, which the residual reveals; it is never trusted unverified."""
     q = matrix.shape[-1]
     identity = jnp.broadcast_to(jnp.eye(q, dtype=matrix.dtype), matrix.shape)
     work = jnp.concatenate([matrix, identity], axis=-1)
@@ -237,38 +284,58 @@ def _verified_inverse(matrix: Any) -> tuple[Any, Any]:
         work = work - work[..., :, i : i + 1] * row
         work = jnp.concatenate([work[..., :i, :], row, work[..., i + 1 :, :]], axis=-2)
     inverse = work[..., q:]
-    error = jnp.abs(_product(inverse, matrix) - identity).sum(-1).max(-1) if q else jnp.zeros(matrix.shape[:-2])
-    return inverse, error < _INVERSE_RESIDUAL * jnp.finfo(matrix.dtype).eps
+    defect = jnp.abs(_product(inverse, matrix) - identity)
+    error = defect.sum(-1).max(-1) if q else jnp.zeros(matrix.shape[:-2])
+    return inverse, defect, error < _INVERSE_RESIDUAL * jnp.finfo(matrix.dtype).eps
 
 
-def centred(right: Interval, N_z: Any, inverse: Any, remainder: Any, within: Interval, rounds: int = 3) -> Interval:
+def centred(
+    right: Interval,
+    N_z: Any,
+    inverse: Any,
+    remainder: Any,
+    bounded_remainder: Any,
+    within: Interval,
+    slip: Any = None,
+    rounds: int = 3,
+) -> Interval:
     """Bound x by its distance from one point c, where ``x + N_z psi(x) in right`` and x lies in `within`.
 
     With ``mid +- rad = right``, ``c <- clip(mid - N_z psi(c))`` a few times and r the last move, ``|x - c| <=
-    (I - |N_z| R)^{-1} (rad + r)``. Clipping is nonexpansive, and keeps c where R bounds the derivative of psi.
+    (I - |N_z| R)^{-1} (rad + r)``. Clipping is nonexpansive, and keeps c where R bounds the derivative of psi. Any c
+    will do, so only the last move is evaluated with its rounding.
 
     Args:
         right: box (n,).
         N_z: (n, q).
-        inverse: ``(I - |N_z| R)^{-1}``, nonnegative, (n, n).
+        inverse: V >= 0 with ``V (I - |N_z| R - slip) >= I``, (n, n).
         remainder: the function psi.
+        bounded_remainder: the same at a point, as a box (q,).
         within: box (n,) on which R holds and in which x is known to lie.
+        slip: (n, n), what `right` leaves of x by rounding.
         rounds: iterations of c.
 
     Source: design 4.3, steps 3 and 6.
     """
-
-    def move(c: Any) -> Any:
-        return jnp.clip(middle - _vector(N_z, remainder(c)), within.lower, within.upper)
-
     middle = right.center
     c = jnp.clip(middle, within.lower, within.upper)
     for _ in range(rounds):
-        c = move(c)
+        c = jnp.clip(middle - _vector(N_z, remainder(c)), within.lower, within.upper)
+    moved = add(Interval.unchecked(middle, middle), image(-N_z, bounded_remainder(c)))
+    moved = Interval.unchecked(*(jnp.clip(side, within.lower, within.upper) for side in (moved.lower, moved.upper)))
+    move = rounding.up(jnp.maximum(abs(moved.upper - c), abs(c - moved.lower)))
     # The radius is taken from the centre that is really used, so that no side is lost where one is infinite.
-    radius = jnp.maximum(right.upper - middle, middle - right.lower)
-    reach = image(inverse, Interval.unchecked(-radius, radius + jnp.abs(c - move(c)))).upper
-    return Interval.unchecked(c - reach, c + reach)
+    radius = rounding.up(jnp.maximum(right.upper - middle, middle - right.lower))
+    far = radius + move if slip is None else radius + move + spread(slip, abs(c))
+    away = spread(inverse, rounding.up(far, 4.0))
+    return Interval.unchecked(
+        rounding.unbounded(rounding.lowered(c - away, abs(c) + away, 2.0), -jnp.inf),
+        rounding.unbounded(rounding.raised(c + away, abs(c) + away, 2.0), jnp.inf),
+    )
+
+
+def _sides(box: Interval) -> tuple[Any, Any]:
+    return box.lower, box.upper
 
 
 def _vector(matrix: Any, vector: Any) -> Any:

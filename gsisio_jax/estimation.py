@@ -13,9 +13,10 @@ import numpy as np
 
 from gsisio_jax import prediction, recursion
 from gsisio_jax.alarms import Alarm, read_alarms
-from gsisio_jax.interval import Interval, is_concrete
+from gsisio_jax.interval import Interval, add, is_concrete
 from gsisio_jax.observer import Carry, Observer, StepOutput, cast
 from gsisio_jax.prediction import PredictionObserver
+from gsisio_jax.rounding import Rounding, check_rounding
 from gsisio_jax.system import Noise
 
 OnConflict = Literal["restart", "hold"]
@@ -33,6 +34,8 @@ class Estimate(eqx.Module):
         margin: (T,) signed slack of the tightest intersection of the step; negative is the size of a contradiction, in
             the unit of the component that `alarms` names.
         source: (T,) code of that intersection (`gsisio_jax.status.Source`).
+        guaranteed: the boxes hold on the machine, rounding included; False for ``rounding="nearest"`` and where the
+            observer is none.
 
     Source: design 7 and 4.6.
     """
@@ -44,6 +47,7 @@ class Estimate(eqx.Module):
     margin: Any
     source: Any
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    guaranteed: bool = eqx.field(static=True, default=True)
 
     def alarms(self) -> list[Alarm]:
         """Every step whose data contradict the stated bounds, in order, with what emptied and by how much.
@@ -62,6 +66,7 @@ def estimate(
     noise: Noise | None = None,
     on_conflict: OnConflict = "restart",
     length: Any = None,
+    rounding: Rounding | None = None,
 ) -> Estimate:
     """Boxes that are certain to contain the states and the unknown inputs of a record.
 
@@ -78,6 +83,8 @@ def estimate(
             from the past alone with y[k] taken as missing ("hold"). Nothing after a conflict is certain unless the data
             that follow are right.
         length: number of rows of `y` that count (ragged batches); rows behind are taken as missing.
+        rounding: "outward": boxes hold on the machine. "nearest": they hold up to rounding errors, and the result says
+            so; for comparisons of speed. None takes that of the observer, which is "outward" by default.
 
     Returns:
         `Estimate`.
@@ -87,7 +94,7 @@ def estimate(
 
     Source: design 4.3 and 7.
     """
-    initial, y, u, noise, observer = _prepare("estimate", observer, initial, y, u, noise, rows=True)
+    initial, y, u, noise, observer = _prepare("estimate", observer, initial, y, u, noise, True, rounding)
     if length is not None:
         _check_length(length, y.shape[0])
         y = cut(y, length)
@@ -101,6 +108,7 @@ def start(
     u0: Any = None,
     noise: Noise | None = None,
     on_conflict: OnConflict = "restart",
+    rounding: Rounding | None = None,
 ) -> tuple[Carry, StepOutput]:
     """First step of an online run (k = 0): the initial box met with the first measurement.
 
@@ -111,13 +119,14 @@ def start(
         u0: first known input (m,).
         noise: bounds of w[0] and v[0]; None takes those of the design.
         on_conflict: as in `estimate`.
+        rounding: as in `estimate`.
 
     Returns:
         The carry for `step` (a pytree that can be saved), and a `StepOutput`.
 
     Source: design 7.
     """
-    initial, y0, u0, noise, observer = _prepare("start", observer, initial, y0, u0, noise, rows=False)
+    initial, y0, u0, noise, observer = _prepare("start", observer, initial, y0, u0, noise, False, rounding)
     return _start(observer, initial, y0, u0, noise, check_on_conflict("start", on_conflict))
 
 
@@ -128,6 +137,7 @@ def step(
     u_k: Any = None,
     noise: Noise | None = None,
     on_conflict: OnConflict = "restart",
+    rounding: Rounding | None = None,
 ) -> tuple[Carry, StepOutput]:
     """One step of an online run: the same numbers as `estimate`.
 
@@ -138,13 +148,14 @@ def step(
         u_k: known input (m,).
         noise: bounds of w[k] and v[k]; None takes those of the design.
         on_conflict: as in `estimate`.
+        rounding: as in `estimate`.
 
     Returns:
         The next carry, and a `StepOutput`; its `input` is the box of d[k-1].
 
     Source: design 7.
     """
-    box, y_k, u_k, noise, observer = _prepare("step", observer, carry.state, y_k, u_k, noise, rows=False)
+    box, y_k, u_k, noise, observer = _prepare("step", observer, carry.state, y_k, u_k, noise, False, rounding)
     # A carry of lower precision is widened to that of the data; nothing is lost.
     return _step(observer, cast(carry, box.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))
 
@@ -156,13 +167,14 @@ def resume(
     u: Any = None,
     noise: Noise | None = None,
     on_conflict: OnConflict = "restart",
+    rounding: Rounding | None = None,
 ) -> tuple[Carry, StepOutput]:
     """Many steps of an online run in one compiled scan: `y` (rows, l) follows the measurement that `carry` has seen.
 
     Returns:
         The carry after the last row, and a `StepOutput` whose arrays have one row per row of `y`.
     """
-    box, y, u, noise, observer = _prepare("resume", observer, carry.state, y, u, noise, rows=True)
+    box, y, u, noise, observer = _prepare("resume", observer, carry.state, y, u, noise, True, rounding)
     return _resume(observer, cast(carry, box.dtype), y, u, noise, check_on_conflict("resume", on_conflict))
 
 
@@ -233,8 +245,9 @@ def _rows_from(noise: Noise, k: int) -> Noise:
 
 def _as_estimate(observer: AnyObserver, out: StepOutput) -> Estimate:
     return Estimate(
-        out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows
-    )
+        out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows,
+        observer.guaranteed and observer.rounding == "outward",
+    )  # fmt: skip
 
 
 def check_on_conflict(call: str, on_conflict: str) -> bool:
@@ -252,9 +265,19 @@ def _check_length(length: Any, rows: int) -> None:
 
 
 def _prepare(
-    call: str, observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise | None, rows: bool
+    call: str,
+    observer: AnyObserver,
+    initial: Interval,
+    y: Any,
+    u: Any,
+    noise: Noise | None,
+    rows: bool,
+    rounding: Rounding | None = None,
 ) -> tuple[Interval, Any, Any, Noise, AnyObserver]:
     """Check shapes (and values of concrete arrays), and bring everything to one dtype, bounds rounded outward."""
+    if rounding is not None:
+        check_rounding(call, rounding)
+        observer = observer if observer.rounding == rounding else observer.with_rounding(rounding)
     system = observer.system
     lead = "(T, " if rows else "("
     if not (isinstance(y, jax.Array | np.ndarray) and jnp.issubdtype(y.dtype, jnp.floating)):
@@ -294,4 +317,18 @@ def _prepare(
             )
     if dtype != np.float64:
         observer = observer.astype(dtype)
-    return initial.astype(dtype), jnp.asarray(y, dtype), jnp.asarray(u, dtype), noise.astype(dtype), observer
+    initial, noise = initial.astype(dtype), noise.astype(dtype)
+    return initial, jnp.asarray(y, dtype), jnp.asarray(u, dtype), _with_lost(y, noise, dtype), observer
+
+
+def _with_lost(y: Any, noise: Noise, dtype: Any) -> Noise:
+    """What a measurement loses when it is rounded to a narrower type belongs to its noise."""
+    if not isinstance(y, np.ndarray) or y.dtype == dtype:
+        return noise
+    narrow = y.astype(dtype)
+    with np.errstate(invalid="ignore"):
+        lost = np.where(np.isnan(y), 0, np.abs(y - narrow.astype(y.dtype)))
+    if not lost.any():
+        return noise
+    radius = Interval(-lost, lost).astype(dtype)
+    return Noise.unchecked(noise.w, add(noise.v, radius))

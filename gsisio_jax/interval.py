@@ -2,8 +2,8 @@
 
 A box is a pair of arrays ``lower <= upper`` of equal shape. Infinite sides are legal (a half-line, all of R^n);
 NaN and crossed bounds are not. Arithmetic here follows the conventions of interval analysis: ``0 * inf = 0``, and no
-operation on legal boxes returns NaN. Everything is differentiable: infinite sides never enter a product that a
-gradient flows through, because ``0 * inf`` in a backward pass would be NaN.
+operation on legal boxes returns NaN. Results are rounded outward (`gsisio_jax.rounding`). Everything is differentiable:
+infinite sides never enter a product that a gradient flows through, because ``0 * inf`` in a backward pass would be NaN.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
+
+from gsisio_jax import rounding
 
 
 def is_concrete(value: Any) -> bool:
@@ -41,6 +43,9 @@ class Interval(eqx.Module):
     Args:
         lower: lower bounds, any shape, ``-inf`` allowed.
         upper: upper bounds, same shape (scalars broadcast), ``inf`` allowed.
+
+    Numbers of 64 bits are rounded outward to 32 at once where JAX knows only those (`jax_enable_x64` is off): JAX
+    itself would round them to nearest, inward half of the time, as soon as the box enters a compiled function.
 
     Raises:
         ValueError: shapes do not agree, a bound is NaN, ``lower`` is ``+inf`` or ``upper`` is ``-inf``, or
@@ -70,8 +75,8 @@ class Interval(eqx.Module):
             lower, upper = (x if x.shape == shape else _broadcast(x, shape) for x in (lower, upper))
         if is_concrete(lower) and is_concrete(upper):
             _check_values(np.asarray(lower), np.asarray(upper))
-        self.lower = lower
-        self.upper = upper
+        self.lower = _representable(lower, -np.inf)
+        self.upper = _representable(upper, np.inf)
 
     @classmethod
     def unchecked(cls, lower: Any, upper: Any) -> Interval:
@@ -137,7 +142,8 @@ class Interval(eqx.Module):
 
     def astype(self, dtype: Any) -> Interval:
         """The smallest box of that floating type that contains this one (a narrowing cast rounds outward)."""
-        return Interval.unchecked(cast_down(self.lower, dtype), cast_up(self.upper, dtype))
+        lower, upper = cast_down(self.lower, dtype), cast_up(self.upper, dtype)
+        return Interval.unchecked(*rounding.normal(lower, upper))
 
     def __repr__(self) -> str:
         if is_concrete(self.lower) and is_concrete(self.upper):
@@ -147,6 +153,12 @@ class Interval(eqx.Module):
 
 def _namespace(*values: Any) -> Any:
     return np if all(isinstance(value, np.ndarray | np.generic) for value in values) else jnp
+
+
+def _representable(value: Any, towards: float) -> Any:
+    """A host array that JAX would round when it sees it, rounded outward before."""
+    dtype = jax.dtypes.canonicalize_dtype(value.dtype)
+    return value if isinstance(value, jax.Array) or value.dtype == dtype else np.asarray(_cast(value, dtype, towards))
 
 
 def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
@@ -171,13 +183,17 @@ def _cast(value: Any, dtype: Any, towards: float) -> Any:
     dtype = jax.dtypes.canonicalize_dtype(dtype)
     if value.dtype == dtype:
         return jnp.asarray(value)
+    tiny = float(jnp.finfo(dtype).tiny)
     if isinstance(value, np.ndarray | np.generic):
         # On the host, before JAX sees the number: with 64-bit types off, JAX itself would round to nearest.
         exact: Any = value
         with np.errstate(all="ignore"):
             cast = np.asarray(exact, dtype)
             wrong = cast > exact if towards < 0 else cast < exact
-            return jnp.asarray(np.where(wrong, np.nextafter(cast, np.asarray(towards, dtype)), cast))
+            moved = np.nextafter(cast, np.asarray(towards, dtype))
+            # Compiled code takes subnormal numbers for zero: they are no bounds.
+            moved = np.where(np.abs(moved) < tiny, np.copysign(tiny, towards), moved)
+            return jnp.asarray(np.where(wrong, moved, cast), dtype)
     cast = value.astype(dtype)
     if jnp.finfo(dtype).bits >= jnp.finfo(value.dtype).bits:
         return cast
@@ -188,6 +204,7 @@ def _cast(value: Any, dtype: Any, towards: float) -> Any:
     step = jax.lax.stop_gradient(jnp.nextafter(fixed, jnp.asarray(towards, dtype)) - fixed)
     largest = jnp.finfo(dtype).max if towards < 0 else jnp.finfo(dtype).min
     moved = jnp.where(jnp.isfinite(fixed), cast + jnp.where(jnp.isfinite(step), step, 0), largest)
+    moved = jnp.where(abs(fixed) <= tiny, jnp.copysign(2 * tiny, towards), moved)
     return jnp.where(wrong, moved, cast)
 
 
@@ -259,22 +276,56 @@ def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
         raise ValueError(
             f"linear_image: a matrix (m, n) and a box (n,) are needed, got {np.shape(matrix)} and {x.shape}"
         )
-    return image(matrix, x)
+    return image(matrix, x.astype(jnp.result_type(matrix, x.dtype)))
 
 
 def image(matrix: Any, x: Interval) -> Interval:
-    """`linear_image` without its checks, for a stack of matrices (..., m, n) and boxes (n,) or (..., n)."""
+    """`linear_image` without its checks, for a stack of matrices (..., m, n) and boxes (n,) or (..., n).
+
+    Rounded outward, also for the exact product with a matrix that was rounded to `matrix` entry by entry.
+    """
+    low, high = products(matrix, x)
+    # A sum of products, not a dot: the batched dot of a tiny matrix is slow, and 0 * inf must not reach it.
+    return Interval.unchecked(rounding.sum_down(low), rounding.sum_up(high))
+
+
+def products(matrix: Any, x: Interval) -> tuple[Any, Any]:
+    """Smallest and largest of every product in ``matrix @ x``, (..., m, n), to nearest; for `rounding.sum_down`."""
     at_lower, at_upper = scale(matrix, x.lower[..., None, :]), scale(matrix, x.upper[..., None, :])
-    # A sum of products, not a dot: the batched dot of a tiny matrix is slow, and 0 * inf must not reach it. Sides are
-    # chosen by sign, not by min and max: those tie on boxes of width 0 and would halve the derivative of the width.
+    # Sides are chosen by sign, not by min and max: those tie on boxes of width 0 and would halve the derivative of the
+    # width.
     up = matrix >= 0
-    lower, upper = jnp.where(up, at_lower, at_upper), jnp.where(up, at_upper, at_lower)
-    return Interval.unchecked(lower.sum(-1), upper.sum(-1))
+    return jnp.where(up, at_lower, at_upper), jnp.where(up, at_upper, at_lower)
+
+
+def spread(matrix: Any, reach: Any) -> Any:
+    """Upper bound of ``matrix @ reach`` for a nonnegative matrix (..., m, n) and reach (n,) or (..., n)."""
+    return rounding.sum_up(scale(matrix, reach[..., None, :]))
 
 
 def add(*boxes: Interval) -> Interval:
     """Minkowski sum of boxes. Lower sides are never +inf and upper sides never -inf, so no NaN can arise."""
-    return Interval.unchecked(sum(box.lower for box in boxes), sum(box.upper for box in boxes))
+    return Interval.unchecked(_add_down([box.lower for box in boxes]), -_add_down([-box.upper for box in boxes]))
+
+
+def _add_down(values: list[Any]) -> Any:
+    total = sum(values[1:], values[0])
+    if len(values) == 1 or not rounding.outward():
+        return total
+    if len(values) == 2:  # one operation: its error goes with the result
+        return rounding.unbounded(rounding.down(total), -jnp.inf)
+    size = sum((abs(value) for value in values[1:]), abs(values[0]))
+    return rounding.unbounded(rounding.lowered(total, size, len(values)), -jnp.inf)
+
+
+def widen(box: Interval, radius: Any) -> Interval:
+    """The box, `radius` larger on either side; nothing where the radius is 0 by construction (None)."""
+    return box if radius is None else add(box, Interval.unchecked(-radius, radius))
+
+
+def reach(box: Interval) -> Any:
+    """Largest magnitude in the box, elementwise."""
+    return jnp.maximum(abs(box.lower), abs(box.upper))
 
 
 def entire_like(box: Any) -> Interval:

@@ -5,17 +5,20 @@ The recursion itself stands in `recursion`.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.certificate import Certificate
-from gsisio_jax.contraction import Bank
+from gsisio_jax.contraction import Bank, Slips
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.abstraction import Abstraction
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval import Interval, is_concrete
+from gsisio_jax.rounding import Rounding
 from gsisio_jax.system import Noise, System
 
 
@@ -23,18 +26,58 @@ class FirstSweep(eqx.Module):
     """How a step begins: with what is known offline of the outputs on the state bounds.
 
     Attributes:
-        form: affine bounds of T2 g there, or None where g takes u.
-        inverses: ``(I - |N_z| R)^{-1}`` there, for the gains named in `gains`.
+        form: affine bounds of T2 g there, or None where g takes u; its offset is that of a slope within `slack`.
+        slack: (q, n), what the slope of the form may be off by.
+        inverses: V >= ``(I - |N_z| R - slips)^{-1}`` there, for the gains named in `gains`.
+        slips: (K, n, n), what every gain leaves of x[k] by rounding, directly or through d[k-1].
+        maps: K = ``(I + N_z (S - C))^{-1}`` for the slope S of the form, for the gains named in `linear`.
+        left: what these leave of x[k]; ``|x| <= |K (...)| + left |x|``.
+        bounds: V >= ``(I - left)^{-1}``.
         gains: indices of the gains for which ``|N_z| R`` contracts there.
-        affine_output: T2 g is affine on the state bounds, so psi is zero.
+        linear: indices of the gains that `maps` belong to.
+        affine_output: T2 g is affine on the state bounds.
 
-    Source: design 4.3, step 3.
+    Source: design 4.3, step 3, and 6.
     """
 
     form: AffineForm | None
+    slack: Any
     inverses: Any
+    slips: Any
+    maps: Any
+    left: Any
+    bounds: Any
     gains: tuple[int, ...] = eqx.field(static=True)
+    linear: tuple[int, ...] = eqx.field(static=True)
     affine_output: bool = eqx.field(static=True)
+
+
+class Guard(eqx.Module):
+    """What rounding leaves of the identities of a design, as upper bounds; see `gsisio_jax.residuals`.
+
+    Attributes:
+        gains, inverses: of the two banks.
+        rows, circuits: of `ExactInputs`: (K, p, p) and (c, p), what they leave of d[k-1].
+        input_inverses: (m, p, p), V with ``|d| <= V |d without x[k]| + input_state |x[k]|`` for the inverses `direct`.
+        input_state: (p, n).
+        growth, input_growth: slope of the certified gain and of the first left inverse around the middle of a box in
+            the region, (n, n) and (p, n), rounded up.
+        feedthrough: (l, p), how far the H of the promise may be from the one that is written.
+        direct: indices of left inverses of [G; H] itself.
+
+    Source: design 6.
+    """
+
+    gains: Slips
+    inverses: Slips
+    rows: Any
+    circuits: Any
+    input_inverses: Any
+    input_state: Any
+    growth: Any
+    input_growth: Any
+    feedthrough: Any
+    direct: tuple[int, ...] = eqx.field(static=True)
 
 
 class ExactInputs(eqx.Module):
@@ -78,6 +121,8 @@ class Observer(eqx.Module):
         output_rows: for every row of T2 the outputs that enter it.
         bounds: the methods of Corollary 1 that bound f and g.
         sweeps: how often the box is contracted in a step.
+        guard: what the gains leave by rounding.
+        rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
     """
 
     system: System
@@ -97,13 +142,59 @@ class Observer(eqx.Module):
     current_input_directions: Any
     abstraction: Abstraction | None
     output_abstraction: Abstraction | None
+    guard: Any  # Guard
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     bounds: tuple[str, ...] = eqx.field(static=True)
     sweeps: int = eqx.field(static=True)
+    rounding: Rounding = eqx.field(static=True, default="outward")
+
+    @property
+    def guaranteed(self) -> bool:
+        """The boxes hold on the machine."""
+        return self.rounding == "outward"
+
+    def with_rounding(self, rounding: Rounding) -> Observer:
+        """The same observer with another rounding."""
+        found = replace(self, rounding=rounding)
+        if "_single" in vars(self) and rounding == "outward":
+            object.__setattr__(found, "_single", vars(self)["_single"])
+        return found
 
     def astype(self, dtype: Any) -> Observer:
-        """The same observer in another floating type; boxes are rounded outward."""
-        return cast(self, dtype)
+        """The same observer in another floating type; boxes are rounded outward.
+
+        Gains of that type are other numbers, so what they leave is computed anew: once per observer, in seconds.
+
+        Raises:
+            ValueError: the type is not float64 or float32, or the observer is traced.
+        """
+        return in_type(self, dtype)
+
+
+def in_type(observer: Observer, dtype: Any) -> Observer:
+    """`Observer.astype`; remembers what it found for that observer."""
+    dtype = np.dtype(jax.dtypes.canonicalize_dtype(dtype))
+    if dtype not in (np.float64, np.float32):
+        raise ValueError(
+            f"Observer.astype: the floating type must be float64 or float32, got {dtype}; convert the data"
+        )
+    leaves = jax.tree.leaves(observer)
+    if all(leaf.dtype == dtype for leaf in leaves if hasattr(leaf, "dtype")) or observer.rounding == "nearest":
+        return cast(observer, dtype)
+    if dtype == np.float64:
+        return cast(observer, dtype)
+    if not all(map(is_concrete, leaves)):
+        raise ValueError(
+            "Observer.astype: the observer is traced, but its gains in another type need numbers; call "
+            "observer.astype(jnp.float32) outside of jit"
+        )
+    found = vars(observer).get("_single")
+    if found is None:
+        from gsisio_jax.guard import single_precision
+
+        found = single_precision(observer)
+        object.__setattr__(observer, "_single", found)
+    return found
 
 
 def cast(tree: Any, dtype: Any) -> Any:

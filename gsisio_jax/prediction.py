@@ -7,11 +7,13 @@ sorted corners.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
+from gsisio_jax import rounding
 from gsisio_jax.certificate import Certificate
 from gsisio_jax.contraction import Evidence, magnitude
 from gsisio_jax.inclusion.abstraction import Abstraction
@@ -19,6 +21,7 @@ from gsisio_jax.inclusion.methods import bound
 from gsisio_jax.interval import Interval, choose, intersect, scale
 from gsisio_jax.observer import Carry, StepOutput, cast
 from gsisio_jax.recursion import current_input, in_box, inside, output_box
+from gsisio_jax.rounding import Rounding
 from gsisio_jax.status import Source, Status, bit_mask
 from gsisio_jax.system import Noise, System
 
@@ -56,12 +59,18 @@ class PredictionObserver(eqx.Module):
     guaranteed: bool = eqx.field(static=True)
     bounds: tuple[str, ...] = eqx.field(static=True)
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
+    rounding: Rounding = eqx.field(static=True, default="outward")
+
+    def with_rounding(self, rounding: Rounding) -> PredictionObserver:
+        """The same observer with another rounding."""
+        return replace(self, rounding=rounding)
 
     def astype(self, dtype: Any) -> PredictionObserver:
         """The same observer in another floating type; boxes are rounded outward."""
         return cast(self, dtype)
 
 
+@rounding.by_observer
 def begin(
     observer: PredictionObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool = False
 ) -> tuple[Carry, StepOutput]:
@@ -70,6 +79,7 @@ def begin(
     return _finish(observer, initial, system.input_bounds, None, y, u, noise)
 
 
+@rounding.by_observer
 def advance(
     observer: PredictionObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool = False
 ) -> tuple[Carry, StepOutput]:
@@ -97,9 +107,9 @@ def _rows(matrix: Any, value: Any, size: int) -> Interval:
     """``matrix @ value``, its first `size` rows upper and the others lower bounds; infinite where a weight meets a
     number that is not finite (a missing measurement, an infinite side)."""
     finite = jnp.isfinite(value)
-    total = scale(matrix, jnp.where(finite, value, 0)).sum(-1)
+    terms = scale(matrix, jnp.where(finite, value, 0))
     lost = ((matrix != 0) & ~finite).any(-1)
-    upper, lower = total[:size], total[size:]
+    upper, lower = rounding.sum_up(terms)[:size], rounding.sum_down(terms)[size:]
     return Interval.unchecked(jnp.where(lost[size:], -jnp.inf, lower), jnp.where(lost[:size], jnp.inf, upper))
 
 

@@ -11,16 +11,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax import inclusion
-from gsisio_jax.contraction import Bank, Evidence, Terms, centred, magnitude, solve_remainder, strips
+from gsisio_jax import inclusion, rounding
+from gsisio_jax.contraction import Bank, Evidence, Slips, Terms, centred, magnitude, solve_remainder, strips
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.methods import bound
-from gsisio_jax.interval import Interval, add, choose, entire_like, image, intersect, scale
+from gsisio_jax.interval import Interval, add, choose, entire_like, image, intersect, reach, spread, widen
 from gsisio_jax.observer import Carry, Observer, StepOutput
 from gsisio_jax.status import Source, Status, bit_mask
 from gsisio_jax.system import Noise, System
 
 
+@rounding.by_observer
 def begin(
     observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool = False
 ) -> tuple[Carry, StepOutput]:
@@ -29,14 +30,15 @@ def begin(
     z = image(observer.T2, output_box(observer.system, y, u, noise.v))
     scale = magnitude(y, initial.lower, initial.upper)
     evidence = prior = Evidence(bounds, scale).meet(initial[None], Source.INITIAL)
-    form = _first_form(observer, u)  # valid on every smaller box: the first sweep serves the fallback too
+    form = _first_form(observer, bounds, u)  # valid on every smaller box: the first sweep serves the fallback too
     fallback = prior if hold else strips(Evidence(bounds, scale), form, z)
     for sweep in range(observer.sweeps):
-        form = form if sweep == 0 else _free_output(observer, evidence.box, u)
+        form = _first_form(observer, evidence.box, u) if sweep == 0 else _free_output(observer, evidence.box, u)
         evidence = strips(evidence, form, z)
     return _finish(observer, evidence, fallback, None, None, y, u, noise, hold)
 
 
+@rounding.by_observer
 def advance(
     observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool = False
 ) -> tuple[Carry, StepOutput]:
@@ -59,7 +61,7 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
 
     # What is known beforehand, as boxes: everything of identity (*) but h(x[k-1]) and psi(x[k]).
     output = output_box(system, y, u, noise.v)
-    drift = add(_point(system.B @ carry.u), carry.noise.w)
+    drift = add(image(system.B, _point(carry.u)), carry.noise.w)
     seen = output_box(system, carry.y, carry.u, carry.noise.v)
     shift = Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
     terms = Terms(
@@ -79,42 +81,110 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
     # 3.-5. Contract from the state bounds; y[k] alone first, because a restart begins there.
     z = image(observer.T2, output)
     evidence = alone = Evidence(bounds, magnitude(y, carry.y, before.lower, before.upper))
-    form, affine = _first_form(observer, u), observer.first.affine_output
+    form, affine = _first_form(observer, bounds, u), observer.first.affine_output
+    evidence = alone = strips(evidence, form, z)
+    missed = _Missed(observer, d_fixed)
+    evidence = _meet_first_boxes(observer, evidence, right, missed, u)
+    right = widen(right, missed.of(observer.guard.gains, evidence.box))
+    d_fixed = widen(d_fixed, missed.of(observer.guard.inverses, evidence.box))
     for sweep in range(observer.sweeps):
-        form = form if sweep == 0 or affine else _free_output(observer, evidence.box, u)
-        evidence = strips(evidence, form, z)
-        if sweep == 0:
-            alone = evidence
-            evidence = _meet_closed_form(observer, evidence, right, u)
-        solved = right if affine else solve_remainder(gains, right, form, observer.C)
-        evidence = evidence.meet(solved, Source.STATE)
+        if affine:
+            form = _first_form(observer, evidence.box, u)
+        elif sweep > 0:
+            form = _free_output(observer, evidence.box, u)
+        if sweep > 0 or affine:
+            evidence = strips(evidence, form, z)
+        evidence = evidence.meet(_solved(observer, right, form, evidence.box), Source.STATE)
     if system.p:
         # The paper's own loop x = f + B u + G d + w: no way to a first box, but a contraction of a correct one.
         d, _ = _inputs(observer, evidence, d_fixed, form)
         evidence = evidence.meet(add(f_now, image(system.G, d))[None], Source.DYNAMICS)
 
     # 6. The certified bound, where both boxes lie in the region. (The form of the last sweep holds on smaller boxes.)
-    evidence, promised = _certified(observer, evidence, before, right, terms, carry.u, u)
+    evidence, promised = _certified(observer, evidence, before, right, terms, missed, carry.u, u)
     d, evidence = _inputs(observer, evidence, d_fixed, form)
-    d, evidence = _certified_input(observer, evidence, promised, d)
-    d, evidence = _exact_input(observer, evidence, add(h.range, shift), terms, d)
+    d, evidence = _certified_input(observer, evidence, promised, missed, d)
+    d, evidence = _exact_input(observer, evidence, add(h.range, shift), terms, d, missed)
     return evidence, alone, d
 
 
-def _meet_closed_form(observer: Observer, evidence: Evidence, right: Interval, u: Any) -> Evidence:
-    """Bounds that need no box to begin with: the contraction |N_z| R < 1 on the state bounds."""
-    chosen = observer.first.gains
-    if not chosen:
-        return evidence
-    right, N_z = jax.tree.map(lambda x: jnp.stack([x[k] for k in chosen]), (right, observer.gains.remainder))
-    boxes = jax.vmap(centred, in_axes=(0, 0, 0, None, None))(
-        right, N_z, observer.first.inverses, _psi(observer, u), observer.system.state_bounds
-    )
-    return evidence.meet(choose(in_box(u, observer.u_region), boxes, entire_like(boxes)), Source.STATE)
+class _Missed:
+    """How far the bounds can be off because the gains do not cancel exactly (design 6).
+
+    ``|d[k-1]| <= inputs + input_state |x[k]|`` from every left inverse, and by the input bounds.
+    """
+
+    def __init__(self, observer: Observer, d_fixed: Interval):
+        guard, bounds = observer.guard, observer.system.input_bounds
+        self.guard, self.limit = guard, reach(bounds)
+        self.inputs = jnp.full_like(self.limit, jnp.inf)
+        if rounding.outward():
+            for i, j in enumerate(guard.direct):
+                self.inputs = jnp.minimum(self.inputs, spread(guard.input_inverses[i], reach(d_fixed[j])))
+
+    def input_reach(self, box: Interval) -> Any:
+        """Bound of ``|d[k-1]|``, (p,), from a box of x[k]."""
+        return jnp.minimum(self.limit, rounding.up(self.inputs + spread(self.guard.input_state, reach(box))))
+
+    def of(self, slips: Slips, box: Interval) -> Any:
+        """Radius (K, r) by which a bank's bounds are to be widened; None to nearest."""
+        if not rounding.outward():
+            return None
+        return slips.radius(reach(box), self.input_reach(box))
+
+    def of_inputs(self, weights: Any, box: Interval) -> Any:
+        """The same for rows that leave only d[k-1], (..., p)."""
+        return spread(weights, self.input_reach(box)) if rounding.outward() else None
+
+
+def _meet_first_boxes(observer: Observer, evidence: Evidence, right: Interval, missed: _Missed, u: Any) -> Evidence:
+    """Bounds that need no box to begin with, for x[k] is unknown still, and with it what the gains leave of it: the
+    contraction |N_z| R < 1 on the state bounds, and the linear form of T2 g there."""
+    first, gains, guard = observer.first, observer.gains, observer.guard
+    if rounding.outward():
+        # What d leaves, but for its part in x[k], which is in the slips of `first`.
+        inputs = jnp.minimum(missed.inputs, missed.limit)
+        right = widen(right, spread(guard.gains.d, inputs))
+    if first.gains:
+        chosen, N_z, slips = _taken(first.gains, right, gains.remainder, first.slips)
+        bounded = _psi_box(observer, u)
+        boxes = jax.vmap(
+            lambda box, N, V, slip: centred(box, N, V, _psi(observer, u), bounded, observer.system.state_bounds, slip)
+        )(chosen, N_z, first.inverses, slips)
+        boxes = choose(in_box(u, observer.u_region), boxes, entire_like(boxes))
+        evidence = evidence.meet(boxes, Source.STATE)
+    if first.linear and first.form is not None:
+        chosen, N_z = _taken(first.linear, right, gains.remainder)
+        boxes = image(first.maps, add(chosen, image(-N_z, first.form.offset)))
+        if rounding.outward():
+            far = jnp.minimum(spread(first.bounds, reach(boxes)), reach(evidence.box))
+            boxes = widen(boxes, spread(first.left, far))
+        evidence = evidence.meet(boxes, Source.STATE)
+    return evidence
+
+
+def _taken(indices: tuple[int, ...], *stacks: Any) -> Any:
+    """Entries of stacks, without a gather."""
+    return jax.tree.map(lambda x: jnp.stack([x[k] for k in indices]), stacks)
+
+
+def _solved(observer: Observer, right: Interval, form: AffineForm, box: Interval) -> Interval:
+    """Box (K, n) of x[k] from ``x + N_z psi(x) in right``; where psi is affine it is known as it stands."""
+    if not observer.first.affine_output:
+        return solve_remainder(observer.gains, right, form, observer.C, box)
+    psi = add(image(form.slope - observer.C, box), form.offset)
+    return add(right, image(-observer.gains.remainder, psi))
 
 
 def _certified(
-    observer: Observer, evidence: Evidence, before: Interval, right: Interval, terms: Terms, u_before: Any, u: Any
+    observer: Observer,
+    evidence: Evidence,
+    before: Interval,
+    right: Interval,
+    terms: Terms,
+    missed: _Missed,
+    u_before: Any,
+    u: Any,
 ) -> tuple[Evidence, _Promised]:
     """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""
     certificate, region = observer.certificate, observer.certificate.region
@@ -124,26 +194,31 @@ def _certified(
         applies = applies & in_box(u_before, observer.u_region) & in_box(u, observer.u_region)
     # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
     c = jnp.where(applies, before.center, region.center)
-    promised = _Promised(applies, c, jnp.where(applies, before.radius, 0), u_before, terms)
+    far = rounding.up(jnp.maximum(before.upper - c, c - before.lower))
+    promised = _Promised(applies, c, jnp.where(applies, far, 0), u_before, terms)
     if not certificate.promised:
         return evidence, promised
     gain = jax.tree.map(lambda x: x[0], observer.gains)
-    joint, slack = intersect(right[0], _around(observer, gain, certificate.growth, promised))
+    around = widen(
+        _around(observer, gain, observer.guard.growth, promised), _first(missed.of(observer.guard.gains, evidence.box))
+    )
+    joint, slack = intersect(right[0], around)
     evidence = evidence.weigh(jnp.where(applies, slack, jnp.inf), Source.STATE)
     safe = choose(applies, evidence.box, Interval.unchecked(c, c))
-    box = centred(joint, gain.remainder, observer.region_inverse, _psi(observer, u), safe)
+    box = centred(joint, gain.remainder, observer.region_inverse, _psi(observer, u), _psi_box(observer, u), safe)
     return evidence.meet(choose(applies, box, entire_like(box))[None], Source.CERTIFICATE), promised
 
 
 def _certified_input(
-    observer: Observer, evidence: Evidence, promised: _Promised, d: Interval
+    observer: Observer, evidence: Evidence, promised: _Promised, missed: _Missed, d: Interval
 ) -> tuple[Interval, Evidence]:
     """The same centred form for d[k-1] with the first left inverse."""
     certificate = observer.certificate
     if not certificate.promised or not observer.system.p:
         return d, evidence
     inverse = jax.tree.map(lambda x: x[0], observer.inverses)
-    around = _around(observer, inverse, certificate.input_state_before, promised)
+    around = _around(observer, inverse, observer.guard.input_growth, promised)
+    around = widen(around, _first(missed.of(observer.guard.inverses, evidence.box)))
     box = add(image(inverse.state, evidence.box), around)
     met, slack = intersect(d, choose(promised.applies, box, entire_like(box)))
     return met, evidence.weigh(slack, Source.INPUT)
@@ -164,37 +239,48 @@ def _around(observer: Observer, row: Bank, slope: Any, promised: _Promised) -> I
 
     No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
     """
-    middle = (row.residual * observer.system.maps(promised.center, promised.u_before)).sum(-1)
-    spread = scale(slope, promised.radius).sum(-1)
-    return add(Interval.unchecked(middle - spread, middle + spread), row.linear(promised.terms))
+    at = inclusion.natural(observer.system.maps)(_point(promised.center), promised.u_before)
+    return add(widen(image(row.residual, at), spread(slope, promised.radius)), row.linear(promised.terms))
+
+
+def _first(radius: Any) -> Any:
+    return None if radius is None else radius[0]
 
 
 def _inputs(observer: Observer, evidence: Evidence, fixed: Interval, form: AffineForm) -> tuple[Interval, Evidence]:
     """Box of d[k-1] from every left inverse, given the box of x[k] (design 4.5)."""
     inverses, box = observer.inverses, evidence.box
     # state x[k] - remainder psi(x[k]) with psi = (S - C) x + [e], slopes combined before the box is applied.
-    slope = inverses.state - (inverses.remainder[..., None] * (form.slope - observer.C)).sum(-2)
+    parts = inverses.remainder[..., None] * (form.slope - observer.C)
+    slope = inverses.state - parts.sum(-2)
     now = add(image(slope, box), image(-inverses.remainder, form.offset), fixed)
+    if rounding.outward():
+        # Of the slopes before they cancelled.
+        lost = spread(abs(inverses.state) + abs(parts).sum(-2), reach(box))
+        now = widen(now, rounding.error(lost, parts.shape[-2] + 6.0))
     d = Evidence(observer.system.input_bounds, evidence.scale).meet(now, Source.INPUT)
     return d.box, evidence.weigh(d.slacks[0], Source.INPUT) if d.slacks else evidence
 
 
 def _exact_input(
-    observer: Observer, evidence: Evidence, known: Interval, terms: Terms, d: Interval
+    observer: Observer, evidence: Evidence, known: Interval, terms: Terms, d: Interval, missed: _Missed | None = None
 ) -> tuple[Interval, Evidence]:
     """The exact box of d[k-1] for ``[G; H] d`` in a box, that of ``[x[k]; 0] - known`` (paper, Lemma 3; design 4.5)."""
     exact, box = observer.exact, evidence.box
     if not observer.system.p:
         return d, evidence
     zero = jnp.zeros(observer.system.l, box.dtype)
-    explained = Interval.unchecked(
-        jnp.concatenate([box.lower, zero]) - known.upper, jnp.concatenate([box.upper, zero]) - known.lower
+    explained = add(
+        Interval.unchecked(jnp.concatenate([box.lower, zero]), jnp.concatenate([box.upper, zero])),
+        Interval.unchecked(-known.upper, -known.lower),
     )
     rows = add(image(exact.rows, explained), image(exact.known, terms.known))
+    rows = rows if missed is None else widen(rows, missed.of_inputs(observer.guard.rows, box))
     met = Evidence(d, evidence.scale).meet(rows, Source.INPUT)
     evidence = evidence.weigh(met.slacks[0], Source.INPUT)
     # Some d must reach the box at all: every combination of rows that is free of d contains 0.
     balance = add(image(exact.circuits, explained), image(exact.circuits_known, terms.known))
+    balance = balance if missed is None else widen(balance, missed.of_inputs(observer.guard.circuits, box))
     return met.box, evidence.weigh(jnp.minimum(balance.upper, -balance.lower), Source.BALANCE)
 
 
@@ -241,18 +327,22 @@ def _finish(
 def current_input(current: Any, h: AffineForm, state: Interval, output: Interval) -> Interval:
     """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
     n, weights = state.shape[0], -current
-    slope = (weights[..., None] * h.slope[n:]).sum(-2)
-    joint = add(image(slope, state), image(weights, h.offset[n:]))
+    parts = weights[..., None] * h.slope[n:]
+    joint = add(image(parts.sum(-2), state), image(weights, h.offset[n:]))
+    if rounding.outward():
+        lost = spread(abs(parts).sum(-2), reach(state))  # of the slopes before they cancelled
+        joint = widen(joint, rounding.error(lost, parts.shape[-2] + 6.0))
     return add(intersect(joint, image(weights, h.range[n:]))[0], image(current, output))
 
 
 def output_box(system: System, y: Any, u: Any, v: Interval) -> Interval:
     """Box of ``y - D u - v``: of ``g(x) + H d``; all of R where y is NaN (or infinite: batches cannot refuse it)."""
     missing = ~jnp.isfinite(y)
-    known = jnp.where(missing, 0, y) - system.D @ u
-    return Interval.unchecked(
-        jnp.where(missing, -jnp.inf, known - v.upper), jnp.where(missing, jnp.inf, known - v.lower)
-    )
+    seen = jnp.where(missing, 0, y)
+    known = add(_point(seen), Interval.unchecked(-v.upper, -v.lower))
+    if system.m:
+        known = add(known, image(-system.D, _point(u)))
+    return choose(missing, entire_like(known), known)
 
 
 def _free_output(observer: Observer, box: Interval, u: Any) -> AffineForm:
@@ -260,10 +350,14 @@ def _free_output(observer: Observer, box: Interval, u: Any) -> AffineForm:
     return bound(_free_map(observer), observer.bounds, observer.output_abstraction)(box, u)
 
 
-def _first_form(observer: Observer, u: Any) -> AffineForm:
-    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes."""
+def _first_form(observer: Observer, box: Interval, u: Any) -> AffineForm:
+    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes. For x in `box`."""
     known = observer.first.form
-    return inclusion.affine(_free_map(observer))(observer.system.state_bounds, u) if known is None else known
+    if known is None:
+        return inclusion.affine(_free_map(observer))(observer.system.state_bounds, u)
+    if not rounding.outward():
+        return known
+    return AffineForm(known.slope, widen(known.offset, spread(observer.first.slack, reach(box))), known.range)
 
 
 def _free_map(observer: Observer) -> Any:
@@ -273,6 +367,11 @@ def _free_map(observer: Observer) -> Any:
 def _psi(observer: Observer, u: Any) -> Any:
     """The remainder T2 g(x) - C x."""
     return lambda x: observer.T2 @ observer.system.measurement(x, u) - observer.C @ x
+
+
+def _psi_box(observer: Observer, u: Any) -> Any:
+    """The same at a point, as a box."""
+    return lambda x: inclusion.natural(_psi(observer, u))(_point(x))
 
 
 def _point(value: Any) -> Interval:

@@ -15,9 +15,10 @@ from gsisio_jax.design.feedthrough import Feedthrough
 from gsisio_jax.design.inputs import InputBounds
 from gsisio_jax.design.planes import plane_bounds
 from gsisio_jax.design.problem import GainProblem, without_rounding
+from gsisio_jax.guard import with_output
 from gsisio_jax.inclusion.abstraction import Abstraction
 from gsisio_jax.interval import Interval
-from gsisio_jax.observer import FirstSweep, Observer
+from gsisio_jax.observer import Observer
 from gsisio_jax.system import Noise, System
 
 
@@ -36,12 +37,12 @@ class Plan:
         bounded = np.isfinite(state_width)
         return GainProblem(
             F=slopes.F,
-            F_radius=slopes.F_radius,
+            F_radius=_beyond_rounding(slopes.F_radius, slopes.F),
             E=slopes.E,
-            E_radius=slopes.E_radius,
+            E_radius=_beyond_rounding(slopes.E_radius, slopes.E),
             T2=self.feedthrough.T2,
             C=np.vstack([slopes.Z, np.eye(system.n)[bounded]]),
-            R=slopes.Z_radius,
+            R=_beyond_rounding(slopes.Z_radius, slopes.Z),
             G=np.asarray(system.G),
             H=np.asarray(system.H),
             free=~np.isfinite(input_width),
@@ -52,25 +53,29 @@ class Plan:
         )
 
 
+def _beyond_rounding(radius: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Radii of enclosures without those that only rounding gave a width: for the program that looks for gains, and for
+    the widths that it expects. What the observer runs with has them."""
+    return np.where(radius <= 1e-13 * np.abs(center).max(initial=1.0), 0.0, radius)
+
+
 def assemble(
     plan: Plan,
     problem: GainProblem,
     region: Interval,
     bank: list[np.ndarray],
-    start: FirstSweep,
     inputs: InputBounds,
     affine: bool,
     bounds: tuple[str, ...],
     sweeps: int,
 ) -> Observer:
-    """The observer of a verified bank of gains, the first of which is the certified one.
+    """The observer of a verified bank of gains, the first of which is the certified one; `guarded` completes it.
 
     Args:
         plan: plant, noise and feedthrough of the design.
         problem: the gain problem on the region.
         region: of the design.
         bank: gains (n, columns).
-        start: how every step begins.
         inputs: bounds of the unknown input.
         affine: f and g are affine on the state bounds, so the promise holds everywhere.
         bounds: the methods that bound f and g online.
@@ -80,10 +85,6 @@ def assemble(
     l, q = problem.l, problem.q
     # Where f and g are affine no enclosure depends on the region, so there is no region to leave.
     certificate = _certificate(plan, problem, Interval.entire(system.n) if affine else region, bank[0], inputs)
-    implicit = np.asarray(certificate.implicit)
-    region_inverse = np.zeros_like(implicit)
-    if certificate.promised:
-        region_inverse = np.maximum(np.linalg.inv(np.eye(problem.n) - implicit), 0.0)
 
     def planes(function: Callable[[Any, Any], Any]) -> Abstraction | None:
         return plane_bounds(system, function, region, plan.u_region) if "abstraction" in bounds else None
@@ -91,30 +92,35 @@ def assemble(
     stacked = np.stack(bank)
     P = without_rounding(np.eye(problem.n) - stacked[:, :, l:] @ problem.C)
     residual = np.asarray(system.G) - stacked @ problem.seen
+    unfinished: Any = None
     return Observer(
         system=system,
         noise=plan.noise,
         certificate=certificate,
-        gains=Bank(
-            residual=np.concatenate([P, -stacked[:, :, :l]], axis=2),
-            output=without_rounding(stacked[:, :, l : l + q] @ problem.T2),
-            remainder=stacked[:, :, l : l + q],
-            bounds=stacked[:, :, l + q :],
-            known=residual[:, :, ~problem.free],
+        gains=with_output(
+            Bank(
+                residual=np.concatenate([P, -stacked[:, :, :l]], axis=2),
+                output=np.zeros((len(bank), problem.n, l)),
+                remainder=stacked[:, :, l : l + q],
+                bounds=stacked[:, :, l + q :],
+                known=residual[:, :, ~problem.free],
+            ),
+            problem.T2,
         ),
-        inverses=inputs.inverses,
+        inverses=with_output(inputs.inverses, problem.T2),
         exact=inputs.exact,
         T2=feedthrough.T2,
         C=problem.C[:q],
         bounded_states=problem.C[q:],
         bounded_inputs=np.eye(problem.G.shape[1])[~problem.free],
-        region_inverse=region_inverse,
+        region_inverse=unfinished,
         u_region=plan.u_region if system.takes_u else Interval.entire(system.m),
-        first=start,
+        first=unfinished,
         current=feedthrough.current,
         current_input_directions=feedthrough.V1,
         abstraction=planes(system.maps),
         output_abstraction=planes(lambda x, u: feedthrough.T2 @ system.measurement(x, u)),
+        guard=unfinished,
         output_rows=feedthrough.output_rows,
         bounds=bounds,
         sweeps=sweeps,

@@ -13,16 +13,17 @@ from gsisio_jax.design.bank import distinct, gains_for_missing, main_gain, profi
 from gsisio_jax.design.enclosures import slopes_on
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
-from gsisio_jax.design.first_sweep import check_first_sweep, contracting_gains, first_form
+from gsisio_jax.design.first_sweep import check_first_sweep
 from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
 from gsisio_jax.design.recovery import recovers
 from gsisio_jax.design.region import find_region
 from gsisio_jax.errors import NoDesignFound
+from gsisio_jax.guard import first_form, guarded
 from gsisio_jax.inclusion.methods import DEFAULT, check_methods
 from gsisio_jax.interval import Interval
-from gsisio_jax.observer import FirstSweep, Observer
+from gsisio_jax.observer import Observer
 from gsisio_jax.prediction import PredictionObserver
 from gsisio_jax.system import Noise, System
 
@@ -130,19 +131,12 @@ def design_observer(
     if missing:
         bank.extend(gains_for_missing(problem, main, box, feedthrough))
     bank = distinct(bank)
-    first = first_form(system, feedthrough.T2, u_region)
-    contracting = contracting_gains(problem, bank, everywhere)
-    check_first_sweep(problem, bank[0], first, contracting[0] is not None)
     steady = problem.steady_width(bank[0])
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
-    start = FirstSweep(
-        form=None if system.g_takes_u else first,
-        inverses=np.array([inverse for inverse in contracting if inverse is not None]).reshape(-1, system.n, system.n),
-        gains=tuple(k for k, inverse in enumerate(contracting) if inverse is not None),
-        affine_output=not everywhere.Z_radius.any(),
-    )
-    inputs = input_bounds(problem, width)
-    observer = assemble(plan, problem, box, bank, start, inputs, everywhere.affine, methods, sweeps)
+    outputs, slack = first_form(system, feedthrough.T2, u_region)
+    observer = assemble(plan, problem, box, bank, input_bounds(problem, width), everywhere.affine, methods, sweeps)
+    observer = guarded(observer, system, slopes, everywhere, outputs, slack, np.float64)
+    check_first_sweep(problem, bank[0], observer, outputs)
     if not missing:
         return observer
     certificate = replace(observer.certificate, recoverable=recovers(observer, width, u_region))

@@ -7,6 +7,7 @@ arithmetic on the decimals that the user wrote.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -94,4 +95,19 @@ def _rational_left_null_space(rows: list[list[Fraction]]) -> list[list[Fraction]
                 work[i] = [a - factor * b for a, b in zip(work[i], work[pivot], strict=True)]
         pivot += 1
     null = [row[p:] for row in work[pivot:]]
-    return [[value / max(abs(entry) for entry in row) for value in row] for row in null]
+    return [_as_floating(row) for row in null]
+
+
+def _as_floating(row: list[Fraction]) -> list[Fraction]:
+    """The row scaled so that its entries are floating numbers, in any precision, where there is such a scale.
+
+    Integers over a power of two: H d may be unbounded, so T2 H = 0 must not be lost by rounding T2.
+    """
+    whole = math.lcm(*(value.denominator for value in row))
+    integers = [int(value * whole) for value in row]
+    shared = math.gcd(*integers)
+    integers = [value // shared for value in integers]
+    largest = max(map(abs, integers))
+    if largest < 2**24:
+        return [Fraction(value, 2 ** (largest - 1).bit_length()) for value in integers]
+    return [value / max(abs(entry) for entry in row) for value in row]

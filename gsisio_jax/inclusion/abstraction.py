@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from gsisio_jax.interval import Interval, entire_like
+from gsisio_jax import rounding
+from gsisio_jax.interval import Interval, entire_like, products
 
 
 class Abstraction(eqx.Module):
@@ -74,14 +75,13 @@ class Abstraction(eqx.Module):
         x_lower = jnp.where(box.lower >= low, box.lower, low)
         x_upper = jnp.where(box.upper <= high, box.upper, high)
         touched = (x_lower <= x_upper).all(-1)
-        lower = _minimum(self.lower_slope, x_lower, x_upper) + self.lower_offset
-        upper = -_minimum(-self.upper_slope, x_lower, x_upper) + self.upper_offset
+        lower = _minimum(self.lower_slope, x_lower, x_upper, self.lower_offset)
+        upper = -_minimum(-self.upper_slope, x_lower, x_upper, -self.upper_offset)
         # Every cell is looked at: a gather would need shapes that depend on the box.
         lower = jnp.where(touched[:, None], jnp.reshape(lower, (-1, lower.shape[-1])), jnp.inf).min(0)
         upper = jnp.where(touched[:, None], jnp.reshape(upper, (-1, upper.shape[-1])), -jnp.inf).max(0)
         known = inside & touched.any()
         nothing = entire_like(lower)
-        # Rounding: to nearest so far; this is the place to widen for the sums above.
         bounds = Interval.unchecked(jnp.where(known, lower, nothing.lower), jnp.where(known, upper, nothing.upper))
         return bounds.astype(box.dtype)
 
@@ -91,7 +91,7 @@ class Abstraction(eqx.Module):
         return jax.tree.map(lambda value: jnp.asarray(value, dtype), self)
 
 
-def _minimum(slope: Any, lower: Any, upper: Any) -> Any:
-    """``A^+ lower - A^- upper``: the least value of A x on boxes (cells, n), A of shape (cells?, m, n)."""
-    up = jnp.maximum(slope, 0)
-    return (up * lower[:, None, :] - (up - slope) * upper[:, None, :]).sum(-1)
+def _minimum(slope: Any, lower: Any, upper: Any, offset: Any) -> Any:
+    """Lower bound of A x + b on boxes (cells, n), A of shape (cells?, m, n)."""
+    low, _ = products(slope, Interval.unchecked(lower, upper))
+    return rounding.sum_down(jnp.concatenate([low, jnp.broadcast_to(offset[..., None], (*low.shape[:-1], 1))], -1))

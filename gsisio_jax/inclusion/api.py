@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from gsisio_jax.inclusion.interpreter import evaluate
 from gsisio_jax.inclusion.node import (
+    Domain,
     Form,
     Node,
     as_node,
@@ -22,10 +23,12 @@ from gsisio_jax.inclusion.node import (
     jac_of,
     product,
     shift,
+    slack_of,
     slope_image,
     slope_of,
 )
 from gsisio_jax.interval import Interval, choose
+from gsisio_jax.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
 
 
 class AffineForm(eqx.Module):
@@ -47,15 +50,17 @@ class AffineForm(eqx.Module):
 
     def over(self, box: Interval) -> Interval:
         """Bounds of f on a box inside X, from slope and offset alone; shape (*out)."""
-        slope = jnp.moveaxis(self.slope, -1, 0)
+        slope = jnp.moveaxis(jnp.asarray(self.slope), -1, 0)
         return guard(shift(slope_image(slope, box.astype(slope.dtype)), self.offset))
 
 
-def natural(f: Callable[..., Any]) -> Callable[..., Any]:
+def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Natural inclusion function of f: every operation replaced by its range.
 
     Args:
         f: takes an array of shape (n,), then any number of further arguments; returns an array of any shape.
+        rounding: "outward" (what None means, too) for bounds that hold on the machine; "nearest" is faster, and its
+            bounds hold up to rounding errors only. A constant expression in f counts as the number it evaluates to.
 
     Returns:
         A function of a box (n,) and of the further arguments, arrays or boxes (the result then holds for all of
@@ -71,6 +76,7 @@ def natural(f: Callable[..., Any]) -> Callable[..., Any]:
     Source: design 5.
     """
 
+    @rounded_by("inclusion.natural", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("natural", box, args)
         return _run(f, Node(box), args, _finish_range)
@@ -78,7 +84,7 @@ def natural(f: Callable[..., Any]) -> Callable[..., Any]:
     return bounds
 
 
-def affine(f: Callable[..., Any]) -> Callable[..., Any]:
+def affine(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Affine bounds of f: a function of a box (n,) and of f's further arguments that returns an `AffineForm`.
 
     Arguments and errors are those of `natural`. Exact, with an offset of width 0, where f is affine; infinite boxes
@@ -91,6 +97,7 @@ def affine(f: Callable[..., Any]) -> Callable[..., Any]:
     Source: design 5.
     """
 
+    @rounded_by("inclusion.affine", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("affine", box, args)
         return _run(f, _variable(box), args, lambda node: _finish_affine(node, box))
@@ -98,7 +105,7 @@ def affine(f: Callable[..., Any]) -> Callable[..., Any]:
     return bounds
 
 
-def jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
+def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Enclosure of the Jacobian of f: a function of a box (n,) and of f's further arguments.
 
     It returns an `Interval` of shape (*out, n) that contains the derivative at every point of the box where f has
@@ -112,6 +119,7 @@ def jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
     Source: design 5.
     """
 
+    @rounded_by("inclusion.jacobian", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("jacobian", box, args)
         return _run(f, _variable(box, derivative=True), args, lambda node: _finish_jacobian(node, box))
@@ -119,26 +127,34 @@ def jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
     return bounds
 
 
-def mean_value(f: Callable[..., Any]) -> Callable[..., Any]:
+def mean_value(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Mean-value form ``f(c) + J (box - c)`` around the center c of the box; arguments and errors as `natural`.
 
     Source: design 5.
     """
     at, slope = natural(f), jacobian(f)
 
+    @rounded_by("inclusion.mean_value", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("mean_value", box, args)
         center = box.center
-        around = Interval.unchecked(box.lower - center, box.upper - center)
+        around = distance(box, center)
         middle, enclosure = at(Interval.unchecked(center, center), *args), slope(box, *args)
 
         def combine(value: Interval, jac: Interval) -> Interval:
             moved = product(jac, around)
-            return guard(shift(value, Interval.unchecked(moved.lower.sum(-1), moved.upper.sum(-1))))
+            return guard(shift(value, Interval.unchecked(sum_down(moved.lower), sum_up(moved.upper))))
 
         return jax.tree.map(combine, middle, enclosure, is_leaf=lambda v: isinstance(v, Interval))
 
     return bounds
+
+
+def distance(box: Interval, point: Any) -> Interval:
+    """Bounds of ``x - point`` over the box."""
+    lower, upper = down(box.lower - point), up(box.upper - point)
+    # A side on which the box ends at the point itself is exactly 0.
+    return Interval.unchecked(jnp.where(box.lower == point, 0, lower), jnp.where(box.upper == point, 0, upper))
 
 
 def _typed(call: str, box: Any, args: tuple[Any, ...]) -> Interval:
@@ -158,7 +174,7 @@ def _variable(box: Interval, derivative: bool = False) -> Node:
     eye = np.eye(box.lower.shape[0], dtype=box.lower.dtype)
     zero = np.zeros(box.shape, box.lower.dtype)
     jac = Interval.unchecked(eye, eye) if derivative else None
-    return Node(box, Form(eye, Interval.unchecked(zero, zero), box), jac)
+    return Node(box, Form(eye, Interval.unchecked(zero, zero), Domain.of(box)), jac)
 
 
 def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable[[Any], Any]) -> Any:
@@ -193,13 +209,32 @@ def _finish_range(node: Node) -> Interval:
 
 
 def _finish_affine(node: Node, box: Interval) -> AffineForm:
-    slope, offset = slope_of(node, box), guard(node.offset)
+    slope, offset = slope_of(node, Domain.of(box)), guard(node.offset if node.form is None else node.form.folded())
     # Slopes that overflowed say nothing: slope 0 does.
     bounds = guard(node.range)
     if is_known(slope):
         return AffineForm(jnp.asarray(np.moveaxis(slope, 0, -1)), jax.tree.map(jnp.asarray, offset), bounds)
     good = jnp.isfinite(jnp.abs(slope).sum(0))
     return AffineForm(jnp.moveaxis(jnp.where(good, slope, 0), 0, -1), choose(good, offset, bounds), bounds)
+
+
+def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
+    """`affine`, but the offset belongs to a slope that is known to within a slack only, returned beside: (*out, n).
+
+    On infinite boxes that is more than an offset which holds for the slope as it stands.
+    """
+
+    def bounds(box: Interval, *args: Any) -> Any:
+        box = _typed("affine", box, args)
+
+        def finish(node: Node) -> tuple[AffineForm, Any]:
+            slope = slope_of(node, Domain.of(box))
+            slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
+            return AffineForm(slope, guard(node.offset), guard(node.range)), slack
+
+        return _run(f, _variable(box), args, finish)
+
+    return bounds
 
 
 def _finish_jacobian(node: Node, box: Interval) -> Interval:

@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax import rounding
 from gsisio_jax.inclusion.curves import CURVES, RECIPROCAL, SQUARE, power
 from gsisio_jax.inclusion.linear import add, move, multiple, structural, total
 from gsisio_jax.inclusion.node import (
     Node,
+    added_slack,
     as_node,
     best_form,
     is_node,
@@ -22,9 +24,11 @@ from gsisio_jax.inclusion.node import (
     moderate,
     parts,
     product,
+    scaled_slack,
     shift,
     slope_of,
     stretch,
+    sum_slack,
     times,
 )
 from gsisio_jax.inclusion.univariate import apply, extremes
@@ -46,14 +50,46 @@ def multiply(x: Any, y: Any) -> Node:
         largest = moderate(cx.dtype)
         tame = (jnp.abs(cx) < largest) & (jnp.abs(cy) < largest)
         cx, cy = jnp.where(tame, cx, 0), jnp.where(tame, cy, 0)
-        spread = jnp.where(tame, times(x.range.radius, y.range.radius), jnp.inf)
-        linear = shift(stretch(cy, x.offset), stretch(cx, y.offset))
-        offset = shift(linear, Interval.unchecked(-cx * cy - spread, -cx * cy + spread))
-        form = best_form(cy * slope_of(x, box) + cx * slope_of(y, box), offset, natural, box)
+        spread = jnp.where(tame, times(_radius(x.range, cx), _radius(y.range, cy)), jnp.inf)
+        form = _envelope(x, y, cx, cy, spread, natural, box)
     jac_x = None if x.jac is None else product(y.range, x.jac)
     jac_y = None if y.jac is None else product(x.range, y.jac)
     node = Node(natural, form, join(jac_x, jac_y))
     return meet(node) if x.form is not None and y.form is not None else node
+
+
+def _radius(a: Interval, center: Any) -> Any:
+    """Largest distance from the center; exactly 0 only on a box of width 0."""
+    if not rounding.outward():
+        return a.radius
+    far = jnp.maximum(a.upper - center, center - a.lower)
+    return jnp.where(far == 0, 0, rounding.up(far))
+
+
+def _envelope(x: Node, y: Node, cx: Any, cy: Any, spread: Any, natural: Interval, box: Any) -> Any:
+    """The form of a product: both factors' forms weighed with the centers, and `spread`."""
+    slope, slack = _weighed([(cy, x), (cx, y)], box)
+    with rounding.using("nearest"):
+        a, b = stretch(cy, x.offset), stretch(cx, y.offset)
+    lower = a.lower + b.lower - cx * cy - spread
+    upper = a.upper + b.upper - cx * cy + spread
+    # Five roundings at most pass through any of these terms.
+    size = abs(cx * cy) + spread
+    lower = rounding.lowered(lower, size + abs(a.lower) + abs(b.lower), 8.0, 8.0)
+    upper = rounding.raised(upper, size + abs(a.upper) + abs(b.upper), 8.0, 8.0)
+    return best_form(slope, Interval.unchecked(lower, upper), natural, box, slack, size)
+
+
+def _weighed(pairs: Sequence[tuple[Any, Node]], box: Any) -> tuple[Any, Any]:
+    """Slope of a sum of two nodes times numbers, and its slack."""
+    slopes = [slope_of(node, box) for _, node in pairs]
+    products = [times(weight, slope) for (weight, _), slope in zip(pairs, slopes, strict=True)]
+    slacks = [
+        scaled_slack(weight, slope, product, None if node.form is None else node.form.slack)
+        for (weight, node), slope, product in zip(pairs, slopes, products, strict=True)
+    ]
+    total = products[0] + products[1]
+    return total, sum_slack(*slacks, added_slack(products[0], products[1], total))
 
 
 def divide(x: Any, y: Any) -> Node:
@@ -62,10 +98,15 @@ def divide(x: Any, y: Any) -> Node:
         return multiply(x, apply(RECIPROCAL, y))
     y = jnp.asarray(y)
     if is_concrete(y):
-        zero = np.asarray(y) == 0
-        return multiple(1 / y, x) if not zero.any() else _unknown_where(zero, multiple(1 / jnp.where(zero, 1, y), x))
+        y = np.asarray(y)
+        zero = y == 0
+        with np.errstate(all="ignore"):
+            inverse = 1 / np.where(zero, 1, y)
+            plain = bool((np.frexp(inverse)[0] * np.sign(inverse) == 0.5).all())  # of a power of two: exact
+        quotient = multiple(inverse, x, rounded=not plain)
+        return _unknown_where(zero, quotient) if zero.any() else quotient
     zero = y == 0
-    return _unknown_where(zero, multiple(1 / jnp.where(zero, 1, y), x))
+    return _unknown_where(zero, multiple(1 / jnp.where(zero, 1, y), x, rounded=True))
 
 
 def _unknown_where(mask: Any, x: Node) -> Node:
@@ -84,7 +125,8 @@ def raise_to(x: Any, p: Any) -> Node:
     log, exp = CURVES["log"], CURVES["exp"]
     if not is_node(x):
         good = jnp.asarray(x) > 0
-        return _unknown_where(~good, apply(exp, multiple(jnp.log(jnp.where(good, x, 1)), p)))
+        base = as_node(jnp.where(good, x, 1), p.shape, p.dtype)
+        return _unknown_where(~good, apply(exp, multiply(p, apply(log, base))))
     result = apply(exp, multiply(p, apply(log, x)))
     # Without knowing that the exponent is no integer, nothing can be said of negative bases.
     return _unknown_where(x.range.lower < 0, result)
@@ -146,6 +188,9 @@ def reduce_products(x: Node, axes: Sequence[int], rule: Any) -> Node:
     return move(lambda v: v[0], x)
 
 
+ANGLE_ULPS = 16.0  # of arctan2, see `curves`
+
+
 def angle(y: Any, x: Any) -> Node:
     """``atan2(y, x)``: exact over all quadrants; across the cut (x < 0, y = 0) it is ``[-pi, pi]``.
 
@@ -159,6 +204,7 @@ def angle(y: Any, x: Any) -> Node:
     corners = extremes([_angle_at(b, a) for a in (xl, xu) for b in (yl, yu)])
     half_turn = jnp.full_like(xl, math.pi)
     natural = choose(cut, Interval.unchecked(-half_turn, half_turn), corners)
+    natural = Interval.unchecked(rounding.down(natural.lower, ANGLE_ULPS), rounding.up(natural.upper, ANGLE_ULPS))
     box, jac = parts([y, x])
     smooth = ~cut & ~((xl <= 0) & (xu >= 0) & (yl <= 0) & (yu >= 0))
     form = None
@@ -177,10 +223,18 @@ def angle(y: Any, x: Any) -> Node:
             points += [(edge, jnp.clip(side * t, xl, xu)) for side in (1, -1)]
         # A point clipped to the edge is a corner: still on the rectangle, so nothing is lost by looking at it.
         rest = extremes([_angle_at(b, a) - sy * b - sx * a for b, a in points])
+        far_y, far_x = (jnp.maximum(abs(p), abs(q)) for p, q in ((yl, yu), (xl, xu)))
+        # An angle is below 4. A point of contact solves its equation to a few ulps of the slope, which over the length
+        # of its edge is as much as the products lose.
+        size = 4 + abs(sy) * far_y + abs(sx) * far_x
+        rest = Interval.unchecked(
+            rounding.lowered(rest.lower, size, 4 * ANGLE_ULPS), rounding.raised(rest.upper, size, 4 * ANGLE_ULPS)
+        )
         linear = shift(stretch(sy, y.offset), stretch(sx, x.offset))
+        slope, slack = _weighed([(sy, y), (sx, x)], box)
+        slack = None if slack is None else jnp.where(finite, slack, 0)
         offset = choose(finite, shift(linear, rest), natural)
-        slope = jnp.where(finite, sy * slope_of(y, box) + sx * slope_of(x, box), 0)
-        form = best_form(slope, offset, natural, box)
+        form = best_form(jnp.where(finite, slope, 0), offset, natural, box, slack, size)
     if jac is None:
         return Node(natural, form)
     over_y = _pull(x.range, y.range, smooth)
@@ -218,4 +272,6 @@ def _pull(a: Interval, b: Interval, smooth: Any) -> Interval:
     values += [at(p, zero) for p in (a.lower, a.upper)]
     for q in (b.lower, b.upper):
         values += [at(jnp.clip(side * q, a.lower, a.upper), q) for side in (1, -1)]
-    return choose(smooth, extremes(values), entire_like(a.lower))
+    pull = extremes(values)
+    pull = Interval.unchecked(rounding.down(pull.lower, 8.0), rounding.up(pull.upper, 8.0))
+    return choose(smooth, pull, entire_like(a.lower))

@@ -29,6 +29,7 @@ from gsisio_jax.inclusion.api import AffineForm, affine
 from gsisio_jax.inclusion.node import times
 from gsisio_jax.inclusion.rows import Rows, check_derivative, room
 from gsisio_jax.interval import Interval
+from gsisio_jax.rounding import Rounding, as_nearest, rounded_by
 
 MAX_CORNER_DIMENSION = 10
 """`remainder` evaluates f at 2^n corners: n may not be larger than this."""
@@ -98,6 +99,7 @@ def decomposition_function(
         raise ValueError(f'inclusion.decomposition_function: `form` must be "cases" or "optimal", got {form!r}')
     share = _cases if form == "cases" else _optimal
 
+    @as_nearest
     def f_d(x: Any, y: Any, *args: Any) -> Any:
         if np.ndim(x) != 1 or np.shape(x) != np.shape(y):
             raise ValueError(
@@ -122,7 +124,9 @@ def decomposition_function(
     return f_d
 
 
-def decomposition(f: Callable[..., Any], derivative: Any = None) -> Callable[..., Any]:
+def decomposition(
+    f: Callable[..., Any], derivative: Any = None, rounding: Rounding | None = None
+) -> Callable[..., Any]:
     """Bounds ``[f_d(lower, upper), f_d(upper, lower)]`` of f by the decomposition function of the paper.
 
     f is evaluated at two corners of the box for every row; where the sign of every derivative of a row is known the
@@ -150,6 +154,7 @@ def decomposition(f: Callable[..., Any], derivative: Any = None) -> Callable[...
     """
     check_derivative("decomposition", derivative)
 
+    @rounded_by("inclusion.decomposition", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("decomposition", f, box, args)
         a, b = rows.derivative(derivative)
@@ -158,7 +163,7 @@ def decomposition(f: Callable[..., Any], derivative: Any = None) -> Callable[...
     return bounds
 
 
-def remainder(f: Callable[..., Any], derivative: Any = None) -> Callable[..., Any]:
+def remainder(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | None = None) -> Callable[..., Any]:
     """Bounds of f by the remainder form, the best of all 2^n choices for every row.
 
     With h_j in {a_j, b_j}, f - h x is monotone in every coordinate and h x is linear: both have exact ranges. A choice
@@ -176,6 +181,7 @@ def remainder(f: Callable[..., Any], derivative: Any = None) -> Callable[..., An
     """
     check_derivative("remainder", derivative)
 
+    @rounded_by("inclusion.remainder", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("remainder", f, box, args)
         n = rows.box.lower.shape[0]
@@ -194,7 +200,7 @@ def remainder(f: Callable[..., Any], derivative: Any = None) -> Callable[..., An
     return bounds
 
 
-def tight(f: Callable[..., Any], derivative: Any = None) -> Callable[..., Any]:
+def tight(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | None = None) -> Callable[..., Any]:
     """The tightest bounds of f that this package has: exact where the signs of the derivative are known.
 
     A row with a derivative of known sign (or zero) in every coordinate is monotone, and two corners give its range. Any
@@ -216,6 +222,7 @@ def tight(f: Callable[..., Any], derivative: Any = None) -> Callable[..., Any]:
     """
     check_derivative("tight", derivative)
 
+    @rounded_by("inclusion.tight", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("tight", f, box, args)
         a, b = rows.derivative(derivative)

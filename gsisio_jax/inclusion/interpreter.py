@@ -1,7 +1,9 @@
 """The interpreter: walk through a jaxpr and apply the rule of every primitive.
 
-What does not depend on the box is evaluated as usual, so constants need no rule. The derivative rules a function may
-carry are ignored: bounds come from its body.
+What does not depend on the box is evaluated as usual, so constants need no rule: an expression of constants counts as
+the number that it evaluates to. Where it depends on data that are not known while tracing (a known input, say), its
+rounding is bounded too, by a box that holds all it may be. The derivative rules a function may carry are ignored:
+bounds come from its body.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from gsisio_jax import rounding
 from gsisio_jax.inclusion import linear, logic
 from gsisio_jax.inclusion.node import (
     Form,
@@ -24,6 +27,7 @@ from gsisio_jax.inclusion.node import (
     as_node,
     chain,
     fold,
+    is_known,
     is_node,
     jac_of,
     join,
@@ -32,7 +36,7 @@ from gsisio_jax.inclusion.node import (
     settle,
     slope_of,
 )
-from gsisio_jax.inclusion.table import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, UnknownPrimitiveError
+from gsisio_jax.inclusion.table import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
 from gsisio_jax.interval import Interval
 
 # Longer loops are kept as loops: compile time grows with every unrolled turn.
@@ -83,6 +87,12 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
 def _constant(eqn: Any, args: Sequence[Any]) -> Any:
     """Nothing depends on the box: evaluate as usual, while tracing where all numbers are known."""
     args = [known_if_concrete(arg) for arg in args]
+    name, out = eqn.primitive.name, eqn.outvars[0].aval
+    rounds = name in ROUNDED and rounding.outward() and jnp.issubdtype(out.dtype, jnp.floating)
+    if rounds and not all(map(is_known, args)):
+        nodes = [as_node(arg, jnp.shape(arg), out.dtype) for arg in args]
+        aligned = nodes if name in REDUCTIONS else _aligned(nodes, out.shape)
+        return settle((REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned))
     return fold(lambda *a: eqn.primitive.bind(*(jnp.asarray(v) for v in a), **eqn.params), *args)
 
 
@@ -174,7 +184,7 @@ def _loop(turn: Callable[..., Any], carry: list[Any], xs: Sequence[Any], length:
         """Entries of the scanned axis first, also in slopes and Jacobians."""
         if not is_node(x):
             return x
-        form = None if x.form is None else (jnp.swapaxes(x.form.slope, 0, 1), x.form.offset)
+        form = None if x.form is None else (jnp.swapaxes(x.form.slope, 0, 1), x.form.folded())
         return x.range, form, jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), x.jac)
 
     def inward(x: Any) -> Any:
@@ -207,7 +217,7 @@ def _bare(value: Any) -> Any:
     """A node without the box, which is the same in every turn."""
     if not is_node(value):
         return value
-    return value.range, None if value.form is None else (value.form.slope, value.form.offset), value.jac
+    return value.range, None if value.form is None else (value.form.slope, value.form.folded()), value.jac
 
 
 def _unstack(form: Any, jac: Any, box: Any) -> tuple[Any, Any]:

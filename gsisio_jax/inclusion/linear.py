@@ -1,7 +1,8 @@
-"""Sums, multiples, and everything that only moves entries about: exact in all domains.
+"""Sums, multiples, and everything that only moves entries about: exact in all domains but for rounding.
 
 A structural primitive (slice, reshape, sum, cumsum, ...) has nonnegative weights, so it is applied to lower and upper
-bounds as it stands, and to slopes and Jacobians once per entry of ``x``.
+bounds as it stands, and to slopes and Jacobians once per entry of ``x``. Where it adds entries, the magnitudes of these
+go through it as well, and what comes out bounds its rounding, in whatever order it adds.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax import rounding
 from gsisio_jax.inclusion.node import (
     Form,
     Node,
+    added_slack,
     as_node,
     chain,
     fold,
+    is_known,
     is_node,
     is_point,
     jac_of,
@@ -26,28 +30,51 @@ from gsisio_jax.inclusion.node import (
     known_if_concrete,
     meet,
     parts,
+    product,
+    scaled_slack,
     shift,
+    slack_of,
     slope_of,
     stretch,
+    sum_slack,
 )
 from gsisio_jax.interval import Interval, is_concrete
 
 
-def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[Any] = ()) -> list[Node]:
+def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[Any] = (), terms: int = 1) -> list[Node]:
     """Apply `fn`, linear with nonnegative weights and no offset, to a list of constants and nodes.
 
-    `fn` takes as many arrays as there are values and returns one array or a list of them. `fixed` are the arrays that
-    it holds besides (masks, indices): if they are not known while tracing, nothing that comes out is.
+    `fn` takes as many arrays as there are values and returns one array or a list of them (one, where it adds). `fixed`
+    are the arrays that it holds besides (masks, indices): if they are not known while tracing, nothing that comes out
+    is. `terms` is the largest number of entries that it adds up; 1 for what only moves them about.
     """
     dtype = next(v.dtype for v in values if is_node(v))
     nodes = [v if is_node(v) else as_node(v, jnp.shape(v), dtype) for v in values]
     box, jac = parts(nodes)
     run = fold if all(is_concrete(v) for v in fixed) else _call
+    adds = terms > 1 and rounding.outward()
+
+    def as_list(result: Any) -> list[Any]:
+        return list(result) if isinstance(result, list | tuple) else [result]
+
+    def side(values: Sequence[Any], call: Callable[..., Any], sign: float) -> Any:
+        result = run(call, *values)
+        if not adds or is_zeros(values):
+            return result
+        size = run(call, *map(abs, values))
+        if is_known(result):
+            # Where at most one of the terms is not 0, nothing was rounded.
+            size = np.where(run(call, *((v != 0).astype(v.dtype) for v in values)) > 1, size, 0)
+            return np.where(size == 0, result, result + sign * rounding.error(size, terms))
+        return rounding.lowered(result, size, terms) if sign < 0 else rounding.raised(result, size, terms)
 
     def both(pairs: Sequence[Interval], call: Callable[..., Any]) -> list[Interval]:
-        lower = run(call, *[p.lower for p in pairs])
-        upper = lower if all(is_point(p) for p in pairs) else run(call, *[p.upper for p in pairs])
-        as_list = list if isinstance(lower, list | tuple) else lambda v: [v]
+        lower = side([p.lower for p in pairs], call, -1)
+        points = all(is_point(p) for p in pairs)
+        same = points and (not adds or is_zeros([p.lower for p in pairs]))
+        upper = lower if same else side([p.upper for p in pairs], call, 1)
+        if points and is_known(lower) and is_known(upper) and np.array_equal(lower, upper):
+            upper = lower
         return [Interval.unchecked(a, b) for a, b in zip(as_list(lower), as_list(upper), strict=True)]
 
     along = jax.vmap(fn)
@@ -55,13 +82,31 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
     forms: list[Any] = [None] * len(ranges)
     jacs: list[Any] = [None] * len(ranges)
     if box is not None:
-        slopes = run(along, *[slope_of(v, box) for v in nodes])
-        slopes = list(slopes) if isinstance(slopes, list | tuple) else [slopes]
+        given = [slope_of(v, box) for v in nodes]
+        slopes = as_list(run(along, *given))
         offsets = both([v.offset for v in nodes], fn)
-        forms = [Form(s, o, box) for s, o in zip(slopes, offsets, strict=True)]
+        slacks: list[Any] = [None] * len(slopes)
+        if any(v.form is not None and v.form.slack is not None for v in nodes):
+            slacks = as_list(run(along, *(slack_of(v, slope) for v, slope in zip(nodes, given, strict=True))))
+        if adds:
+            slacks[0] = sum_slack(slacks[0], _lost(run, along, given, terms))
+        forms = [Form(s, o, box, e) for s, o, e in zip(slopes, offsets, slacks, strict=True)]
     if jac is not None:
         jacs = both([jac_of(v, jac.lower.shape[0]) for v in nodes], along)
     return [Node(*triple) for triple in zip(ranges, forms, jacs, strict=True)]
+
+
+def is_zeros(values: Sequence[Any]) -> bool:
+    """Arrays that are known to hold nothing but zeros."""
+    return all(is_known(v) and not v.any() for v in values)
+
+
+def _lost(run: Any, along: Any, slopes: Sequence[Any], terms: int) -> Any:
+    """What adding the slopes loses. A sum of which one term is not zero is exact, as in a product with the identity."""
+    size = run(along, *map(abs, slopes))
+    several = run(along, *((s != 0).astype(s.dtype) for s in slopes)) > 1
+    lost = size * np.dtype(size.dtype).type((terms + 1) * float(jnp.finfo(size.dtype).eps))
+    return np.where(several, lost, 0) if is_known(lost) else jax.lax.stop_gradient(jnp.where(several, lost, 0))
 
 
 def _call(fn: Callable[..., Any], *values: Any) -> Any:
@@ -73,13 +118,20 @@ def move(fn: Callable[[Any], Any], value: Any) -> Any:
     return structural(fn, [value])[0] if is_node(value) else fold(fn, known_if_concrete(value))
 
 
-def multiple(factor: Any, x: Node) -> Node:
-    """``factor * x`` for a constant factor."""
+def multiple(factor: Any, x: Node, rounded: bool = False) -> Node:
+    """``factor * x`` for a constant factor; `rounded` where the factor itself is the result of one operation."""
     factor = known_if_concrete(factor, x.dtype)
+    if is_known(factor) and ((factor != 0) & (np.abs(factor) < np.finfo(x.dtype).tiny)).any():
+        # Compiled code would take it for zero: a thin box, without form.
+        thin = as_node(factor, np.broadcast_shapes(np.shape(factor), x.shape), x.dtype).range
+        return Node(product(thin, x.range), None, None if x.jac is None else product(thin, x.jac))
+    ulps = 4.0 if rounded else 2.0
     form = x.form
     if form is not None:
-        form = Form(factor * form.slope, stretch(factor, form.offset), form.box)
-    return Node(stretch(factor, x.range), form, None if x.jac is None else stretch(factor, x.jac))
+        slope = factor * form.slope
+        slack = scaled_slack(factor, form.slope, slope, form.slack, ulps)
+        form = Form(slope, stretch(factor, form.offset, ulps), form.box, slack)
+    return Node(stretch(factor, x.range, ulps), form, None if x.jac is None else stretch(factor, x.jac, ulps))
 
 
 def negative(x: Node) -> Node:
@@ -87,7 +139,7 @@ def negative(x: Node) -> Node:
         lower = -a.upper
         return Interval.unchecked(lower, lower if is_point(a) else -a.lower)
 
-    form = None if x.form is None else Form(-x.form.slope, flip(x.form.offset), x.form.box)
+    form = None if x.form is None else Form(-x.form.slope, flip(x.form.offset), x.form.box, x.form.slack)
     return Node(flip(x.range), form, None if x.jac is None else flip(x.jac))
 
 
@@ -101,11 +153,13 @@ def add(x: Any, y: Any) -> Node:
     total = shift(x.range, y.range)
     if form is None:
         return Node(total, None, join(x.jac, y.jac))
-    both = x.form is not None and y.form is not None
-    slope = x.form.slope + y.form.slope if x.form is not None and y.form is not None else form.slope
-    node = Node(total, Form(slope, shift(x.offset, y.offset), form.box), join(x.jac, y.jac))
-    # With one form only there is nothing to cancel, and the range is what it was, moved.
-    return meet(node) if both else node
+    offset = shift(x.offset, y.offset)
+    if x.form is None or y.form is None:
+        # With one form only there is nothing to cancel, and the range is what it was, moved.
+        return Node(total, Form(form.slope, offset, form.box, form.slack), join(x.jac, y.jac))
+    slope = x.form.slope + y.form.slope
+    slack = sum_slack(x.form.slack, y.form.slack, added_slack(x.form.slope, y.form.slope, slope))
+    return meet(Node(total, Form(slope, offset, form.box, slack), join(x.jac, y.jac)))
 
 
 def subtract(x: Any, y: Any) -> Node:
@@ -115,7 +169,8 @@ def subtract(x: Any, y: Any) -> Node:
 def total(node: Node, axes: Sequence[int]) -> Node:
     """Sum over axes."""
     axes = tuple(axes)
-    return meet(move(lambda v: v.sum(axes), node))
+    terms = int(np.prod([node.shape[axis] for axis in axes]))
+    return meet(structural(lambda v: v.sum(axes), [node], terms=terms)[0])
 
 
 def elementwise(x: Node, natural: Interval, derivative: Interval | None) -> Node:

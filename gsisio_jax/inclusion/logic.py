@@ -12,6 +12,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from gsisio_jax import rounding
 from gsisio_jax.inclusion.bilinear import divide, multiply, pick
 from gsisio_jax.inclusion.curves import RELU, SOFTPLUS
 from gsisio_jax.inclusion.linear import add, negative, structural, subtract
@@ -27,11 +28,15 @@ from gsisio_jax.inclusion.node import (
     meet,
     parts,
     shift,
+    slack_of,
     slope_image,
     slope_of,
+    sum_slack,
 )
 from gsisio_jax.inclusion.univariate import apply
 from gsisio_jax.interval import Interval, choose, entire_like, hull
+
+LOG_ADD_EXP_ULPS = 512.0
 
 
 def step(outcome: Interval, inputs: Sequence[Any]) -> Node:
@@ -114,8 +119,9 @@ def staircase(fn: Callable[[Any], Any], below: float, above: float) -> Callable[
         node = step(natural, [x])
         if x.form is None:
             return node
-        offset = Interval.unchecked(x.form.offset.lower + below, x.form.offset.upper + above)
-        return Node(natural, best_form(x.form.slope, offset, natural, x.form.box), node.jac)
+        before = x.form.offset
+        offset = Interval.unchecked(rounding.down(before.lower + below), rounding.up(before.upper + above))
+        return Node(natural, best_form(x.form.slope, offset, natural, x.form.box, x.form.slack), node.jac)
 
     return rule
 
@@ -136,7 +142,7 @@ def _remainder(rounding: Callable[[Any], Any], x: Any, y: Any) -> Node:
     low, high = rounding(quotient.lower), rounding(quotient.upper)
     known = (low == high) & jnp.isfinite(low)
     count = jnp.where(known, low, 0)
-    exact = subtract(x, multiply(count, y) if is_node(y) else count * y)
+    exact = subtract(x, multiply(count, y if is_node(y) else as_node(y, shape, dtype)))
     if rounding is jnp.floor:
         bounds = Interval.unchecked(jnp.minimum(b.lower, 0), jnp.maximum(b.upper, 0))
     else:
@@ -161,13 +167,23 @@ def log_add_exp(x: Any, y: Any) -> Node:
     if not is_node(x):
         x, y = y, x
     y = y if is_node(y) else as_node(y, x.shape, x.dtype)
-    natural = Interval.unchecked(_log_add_exp(x.range.lower, y.range.lower), _log_add_exp(x.range.upper, y.range.upper))
+    low, high = x.range.lower, x.range.upper
+    first, last = _log_add_exp(low, y.range.lower), _log_add_exp(high, y.range.upper)
+    # max(x, y) + log1p(exp(-|x - y|)): the sum may cancel, so its error goes with the two terms.
+    natural = Interval.unchecked(
+        rounding.lowered(first, abs(first) + 1, LOG_ADD_EXP_ULPS),
+        rounding.raised(last, abs(last) + 1, LOG_ADD_EXP_ULPS),
+    )
     bend = apply(SOFTPLUS, subtract(Node(x.range, x.form), Node(y.range, y.form)))
     total = add(bend, Node(y.range, y.form))
-    form = total.form and best_form(total.form.slope, total.form.offset, natural, total.form.box)
+    form = total.form
+    form = form and best_form(form.slope, form.offset, natural, form.box, form.slack)
     gap = subtract(Node(x.range, x.form), Node(y.range, y.form)).range
     share = SOFTPLUS.derivative(gap.lower, gap.upper)
-    rest = Interval.unchecked(1 - share.upper, 1 - share.lower)
+    rest = Interval.unchecked(
+        jnp.maximum(rounding.lowered(1 - share.upper, jnp.ones_like(share.upper), 2.0), 0),
+        jnp.minimum(rounding.raised(1 - share.lower, jnp.ones_like(share.lower), 2.0), 1),
+    )
     return meet(Node(natural, form, join(chain(share, x.jac), chain(rest, y.jac))))
 
 
@@ -191,10 +207,12 @@ def maximum(x: Any, y: Any) -> Node:
     form = None
     if box is not None:
         part = add(apply(RELU, gap), Node(y.range, y.form))
-        form = best_form(slope_of(part, box), part.offset, natural, box)
+        form = best_form(slope_of(part, box), part.offset, natural, box, None if part.form is None else part.form.slack)
         for mask, node in ((second, y), (first, x)):
-            slope = jnp.where(mask, slope_of(node, box), form.slope)
-            form = Form(slope, choose(mask, node.offset, form.offset), box)
+            slope, slack = jnp.where(mask, slope_of(node, box), form.slope), form.slack
+            if rounding.outward():
+                slack = jnp.where(mask, slack_of(node, slope), 0 if slack is None else slack)
+            form = Form(slope, choose(mask, node.offset, form.offset), box, slack)
     if jac is not None:
         size = jac.lower.shape[0]
         jx, jy = jac_of(x, size), jac_of(y, size)
@@ -245,7 +263,11 @@ def select(which: Any, *cases: Any) -> Any:
         for mask, own in zip(single, slopes, strict=True):
             slope = jnp.where(mask, own, slope)
         offsets = [shift(v.offset, slope_image(own - slope, box)) for v, own in zip(nodes, slopes, strict=True)]
-        form = best_form(slope, _possible_hull(possible, offsets), natural, box)
+        slack = None
+        if rounding.outward():
+            # What every case lost; the rounding of ``own - slope`` is in the image above.
+            slack = sum_slack(*(v.form.slack for v in nodes if v.form is not None))
+        form = best_form(slope, _possible_hull(possible, offsets), natural, box, slack)
     if jac is not None:
         size = jac.lower.shape[0]
         jac = _possible_hull(possible, [jac_of(v, size) for v in nodes])

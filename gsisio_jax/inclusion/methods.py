@@ -12,9 +12,10 @@ from typing import Any
 import jax.numpy as jnp
 
 from gsisio_jax.inclusion.abstraction import Abstraction
-from gsisio_jax.inclusion.api import AffineForm, affine, jacobian, mean_value, natural
+from gsisio_jax.inclusion.api import AffineForm, affine, distance, jacobian, mean_value, natural
 from gsisio_jax.inclusion.decomposition import decomposition, remainder
-from gsisio_jax.interval import Interval, choose
+from gsisio_jax.interval import Interval, choose, reach
+from gsisio_jax.rounding import Rounding, lowered, raised, rounded_by, unbounded, up
 
 METHODS = ("affine", "natural", "decomposition", "remainder", "mean_value", "abstraction")
 DEFAULT = ("affine", "natural")
@@ -40,6 +41,7 @@ def bound(
     methods: Sequence[str] = DEFAULT,
     abstraction: Abstraction | None = None,
     derivative: Interval | None = None,
+    rounding: Rounding | None = None,
 ) -> Callable[..., AffineForm]:
     """Bounds of f by several methods, intersected: a function of a box (n,) and of f's further arguments.
 
@@ -50,6 +52,7 @@ def bound(
         abstraction: planes of ``lambda z: f(z[:n], z[n:])`` (of f itself where f takes x alone), for "abstraction".
         derivative: box (r, n) that contains the derivative everywhere, for "decomposition" and "remainder"; None
             encloses it on the box at hand, which is tighter.
+        rounding: as in `natural`.
 
     Returns:
         A function that returns an `AffineForm`: its range is the intersection of all ranges; its slope is that of the
@@ -71,6 +74,7 @@ def bound(
         "mean_value": mean_value(f),
     }
 
+    @rounded_by("inclusion.bound", rounding)
     def bounds(box: Interval, *args: Any) -> AffineForm:
         form, ranges = None, []
         if "affine" in chosen:
@@ -104,13 +108,20 @@ def _mean_value_form(f: Callable[..., Any], box: Interval, *args: Any) -> Affine
     enclosure, center = jacobian(f)(box, *args), box.center
     finite = jnp.isfinite(enclosure.lower) & jnp.isfinite(enclosure.upper)
     slope = jnp.where(finite, enclosure.center, 0)
-    around = Interval.unchecked(box.lower - center, box.upper - center)
-    radius = jnp.where(finite, enclosure.radius, jnp.inf)
-    reach = jnp.maximum(-around.lower, around.upper)
-    spread = jnp.where(reach == 0, 0, jnp.where(radius == 0, 0, radius * reach)).sum(-1)
+    radius = jnp.where(finite, up(jnp.maximum(enclosure.upper - slope, slope - enclosure.lower)), jnp.inf)
+    radius = jnp.where(enclosure.lower == enclosure.upper, 0, radius)
+    around = reach(distance(box, center))
+    spread = jnp.where(around == 0, 0, jnp.where(radius == 0, 0, radius * around))
     at_center = natural(f)(Interval.unchecked(center, center), *args)
-    middle = Interval.unchecked(at_center.lower - slope @ center, at_center.upper - slope @ center)
-    offset = Interval.unchecked(middle.lower - spread, middle.upper + spread)
+    moved = slope * center
+    size = abs(moved).sum(-1) + spread.sum(-1)
+    lower = at_center.lower - moved.sum(-1) - spread.sum(-1)
+    upper = at_center.upper - moved.sum(-1) + spread.sum(-1)
+    terms = 2.0 * slope.shape[-1] + 4.0
+    offset = Interval.unchecked(
+        unbounded(lowered(lower, abs(at_center.lower) + size, terms, terms), -jnp.inf),
+        unbounded(raised(upper, abs(at_center.upper) + size, terms, terms), jnp.inf),
+    )
     return AffineForm(slope, offset, offset)
 
 

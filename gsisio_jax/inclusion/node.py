@@ -8,6 +8,11 @@ Three tiers, from least to most:
 - a `Node` with a `Form` and, if derivatives were asked for, with an enclosure of its Jacobian.
 
 Inside the engine the axis over the entries of ``x`` comes first, so that slopes broadcast against values.
+
+Rounding: ranges, offsets and Jacobians are boxes, rounded outward by every operation here (`gsisio_jax.rounding`). A
+slope is rounded to nearest, and what that may have lost is kept beside it, as `slack`: times the reach of the box it
+belongs to the offset. Kept apart, because the box may be infinite, and because slopes of linear functions are often
+exact: then the form of such a function on an infinite box stays what it is.
 """
 
 from __future__ import annotations
@@ -20,7 +25,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from gsisio_jax.interval import Interval, choose
+from gsisio_jax import rounding
+from gsisio_jax.interval import Interval, choose, reach
+
+_LOSS = 64.0  # in best_form: narrower by less than this many ulps is narrower by rounding
 
 
 @jax.custom_jvp
@@ -43,16 +51,47 @@ def moderate(dtype: Any) -> float:
     return float(info.max) * float(info.eps) ** 2
 
 
+class Domain(eqx.Module):
+    """The box of x, and the largest magnitude of every entry."""
+
+    lower: Any
+    upper: Any
+    reach: Any
+
+    @classmethod
+    def of(cls, box: Interval) -> Domain:
+        return cls(box.lower, box.upper, reach(box))
+
+
 class Form(eqx.Module):
-    """``value - slope . x`` lies in ``offset`` for every x of ``box``; slope has shape (n, *shape)."""
+    """``value - s . x`` lies in ``offset`` for every x of ``box``, with some s within ``slack`` of ``slope``.
+
+    Slope and slack have shape (n, *shape); no slack (None): the slope is exact.
+    """
 
     slope: Any
     offset: Interval
-    box: Interval
+    box: Domain
+    slack: Any = None
+
+    def folded(self) -> Interval:
+        """The offset that belongs to the slope alone."""
+        if self.slack is None:
+            return self.offset
+        return loosened(self.offset, slope_reach(self.slack, self.box), self.slope.shape[0] + 4.0)
 
     def image(self) -> Interval:
         """Bounds of the value that follow from the form alone."""
-        return shift(slope_image(self.slope, self.box), self.offset)
+        low, high = slope_products(self.slope, self.box)
+        lower, upper = low.sum(0) + self.offset.lower, high.sum(0) + self.offset.upper
+        if not rounding.outward():
+            return Interval.unchecked(lower, upper)
+        n = low.shape[0] + 6.0
+        # The slack counts whole; its own rounding is far below what it was taken too large by.
+        loss = 0 if self.slack is None else slope_reach(self.slack, self.box)
+        lower = lower - (loss + rounding.error(abs(low).sum(0) + abs(self.offset.lower) + loss, n, n))
+        upper = upper + (loss + rounding.error(abs(high).sum(0) + abs(self.offset.upper) + loss, n, n))
+        return Interval.unchecked(lower, upper)
 
 
 class Node(eqx.Module):
@@ -107,65 +146,161 @@ def is_point(a: Interval) -> bool:
     return a.lower is a.upper
 
 
+def is_zero(a: Interval) -> bool:
+    """Known to be exactly 0."""
+    return is_known(a.lower) and is_known(a.upper) and not (a.lower.any() or a.upper.any())
+
+
 def shift(a: Interval, b: Interval) -> Interval:
     """Sum of two boxes."""
+    if np.shape(a.lower) == np.shape(b.lower) and (is_zero(a) or is_zero(b)):
+        return a if is_zero(b) else b
+    if all(is_known(side) for side in (a.lower, a.upper, b.lower, b.upper)):
+        lower, upper = rounding.known_sum(a.lower, b.lower)
+        return Interval.unchecked(
+            lower, upper if is_point(a) and is_point(b) else rounding.known_sum(a.upper, b.upper)[1]
+        )
     lower = a.lower + b.lower
-    return Interval.unchecked(lower, lower if is_point(a) and is_point(b) else a.upper + b.upper)
+    upper = lower if is_point(a) and is_point(b) else a.upper + b.upper
+    return Interval.unchecked(rounding.down(lower), rounding.up(upper))
 
 
-def stretch(factor: Any, a: Interval) -> Interval:
-    """Product of a number and a box."""
+def stretch(factor: Any, a: Interval, ulps: float = 2.0) -> Interval:
+    """Product of a number and a box; with more `ulps` for a factor that was itself rounded."""
     if is_known(factor) and np.isfinite(factor).all():
-        return _stretch_known(factor, a)
+        return _stretch_known(factor, a, ulps)
     if is_point(a):
         value = times(factor, a.lower)
-        return Interval.unchecked(value, value)
+        return Interval.unchecked(rounding.down(value, ulps), rounding.up(value, ulps))
     up = factor >= 0
-    return Interval.unchecked(
-        times(factor, jnp.where(up, a.lower, a.upper)), times(factor, jnp.where(up, a.upper, a.lower))
-    )
+    lower, upper = times(factor, jnp.where(up, a.lower, a.upper)), times(factor, jnp.where(up, a.upper, a.lower))
+    return Interval.unchecked(rounding.down(lower, ulps), rounding.up(upper, ulps))
 
 
-def _stretch_known(factor: Any, a: Interval) -> Interval:
+def _stretch_known(factor: Any, a: Interval, ulps: float) -> Interval:
     """`stretch` by numbers whose signs are known: no test for ``0 * inf`` where none of them is 0."""
+    if is_known(a.lower) and is_known(a.upper) and ulps == 2.0:
+        return _known_multiple(factor, a)
 
     def multiple(value: Any) -> Any:
-        if (factor == 0).all() and is_known(value):
-            return factor * np.zeros_like(value)
         return jnp.where(factor == 0, 0, factor * value) if (factor == 0).any() else factor * value
+
+    def bounds(lower: Any, upper: Any) -> Interval:
+        if ulps == 2.0 and is_exact(factor):
+            return Interval.unchecked(lower, upper)
+        low, high = rounding.down(lower, ulps), rounding.up(upper, ulps)
+        if rounding.outward() and (factor == 0).any():
+            low, high = jnp.where(factor == 0, 0, low), jnp.where(factor == 0, 0, high)
+        return Interval.unchecked(low, high)
 
     if is_point(a):
         value = multiple(a.lower)
-        return Interval.unchecked(value, value)
+        return bounds(value, value)
     up = factor >= 0
     if up.all():
-        return Interval.unchecked(multiple(a.lower), multiple(a.upper))
+        return bounds(multiple(a.lower), multiple(a.upper))
     if not up.any():
-        return Interval.unchecked(multiple(a.upper), multiple(a.lower))
-    return Interval.unchecked(multiple(jnp.where(up, a.lower, a.upper)), multiple(jnp.where(up, a.upper, a.lower)))
+        return bounds(multiple(a.upper), multiple(a.lower))
+    return bounds(multiple(jnp.where(up, a.lower, a.upper)), multiple(jnp.where(up, a.upper, a.lower)))
+
+
+def _known_multiple(factor: Any, a: Interval) -> Interval:
+    lower, upper = rounding.known_product(factor, a.lower)
+    if is_point(a):
+        return Interval.unchecked(lower, upper)
+    other = rounding.known_product(factor, a.upper)
+    return Interval.unchecked(np.minimum(lower, other[0]), np.maximum(upper, other[1]))
+
+
+def is_exact(factor: Any) -> bool:
+    """Powers of two (or 0) of magnitude one at least: a product with them rounds nothing, and nothing is flushed."""
+    size = np.abs(factor)
+    return bool(((size == 0) | ((np.frexp(size)[0] == 0.5) & (size >= 1))).all())
 
 
 def product(a: Interval, b: Interval) -> Interval:
     """Product of two boxes."""
     p, q = times(a.lower, b.lower), times(a.lower, b.upper)
     r, s = times(a.upper, b.lower), times(a.upper, b.upper)
+    lower, upper = jnp.minimum(jnp.minimum(p, q), jnp.minimum(r, s)), jnp.maximum(jnp.maximum(p, q), jnp.maximum(r, s))
+    return Interval.unchecked(rounding.down(lower), rounding.up(upper))
+
+
+def slope_products(slope: Any, box: Any) -> tuple[Any, Any]:
+    """Smallest and largest of every product of a slope (n, *shape) with the box (n,), to nearest."""
+    side = (-1,) + (1,) * (slope.ndim - 1)
+    lower, upper = jnp.reshape(box.lower, side), jnp.reshape(box.upper, side)
+    with rounding.using("nearest"):
+        image = stretch(slope, Interval.unchecked(lower, upper))
+    return image.lower, image.upper
+
+
+def slope_image(slope: Any, box: Any) -> Interval:
+    """Image of the box (n,) under the slope (n, *shape), each entry of which may have been rounded once."""
+    low, high = slope_products(slope, box)
+    return Interval.unchecked(rounding.sum_down(low, 0), rounding.sum_up(high, 0))
+
+
+def slope_reach(slope: Any, box: Domain) -> Any:
+    """``sum |slope| reach``, to nearest; ``0 * inf = 0``."""
+    far = jnp.reshape(box.reach, (-1,) + (1,) * (slope.ndim - 1))
+    size = abs(slope)
+    if is_known(size):
+        terms = jnp.where(size == 0, 0, size * far) if (size == 0).any() else size * far
+    else:
+        terms = jnp.where(size == 0, 0, size * far)
+    return jax.lax.stop_gradient(terms).sum(0)
+
+
+def loosened(a: Interval, radius: Any, ulps: float = 2.0) -> Interval:
+    """The box, `radius` larger on either side, which is itself known to some `ulps`."""
+    lower, upper = a.lower - radius, a.upper + radius
     return Interval.unchecked(
-        jnp.minimum(jnp.minimum(p, q), jnp.minimum(r, s)), jnp.maximum(jnp.maximum(p, q), jnp.maximum(r, s))
+        rounding.lowered(lower, abs(a.lower) + radius, ulps), rounding.raised(upper, abs(a.upper) + radius, ulps)
     )
 
 
-def slope_image(slope: Any, box: Interval) -> Interval:
-    """Image of the box (n,) under the slope (n, *shape)."""
-    side = (-1,) + (1,) * (slope.ndim - 1)
-    lower, upper = jnp.reshape(box.lower, side), jnp.reshape(box.upper, side)
-    image = stretch(slope, Interval.unchecked(lower, upper))
-    return Interval.unchecked(image.lower.sum(0), image.upper.sum(0))
+def sum_slack(*slacks: Any) -> Any:
+    """Sum of slacks. Each is at least twice of what was lost, so its own rounding needs no care."""
+    present = [slack for slack in slacks if slack is not None and not (is_known(slack) and not slack.any())]
+    return sum(present[1:], present[0]) if present and rounding.outward() else None
+
+
+def scaled_slack(factor: Any, slope: Any, product: Any, slack: Any, ulps: float = 2.0) -> Any:
+    """Slack of ``product = factor * slope``, the slope having a slack itself; exactly 0 where a factor is."""
+    if not rounding.outward():
+        return None
+    if is_known(product):
+        low, high = rounding.known_product(factor, slope)
+        new = high - low if ulps == 2.0 else 4 * np.spacing(np.abs(product)) * (product != 0)
+        return sum_slack(new, None if slack is None else np.abs(factor) * slack)
+    before = None if slack is None else abs(factor) * slack
+    if ulps == 2.0 and is_known(factor) and is_exact(factor):
+        return sum_slack(before)
+    info = jnp.finfo(product.dtype)
+    kind = np.dtype(product.dtype).type
+    lost = abs(product) * kind(ulps * info.eps) + kind(info.tiny)
+    return sum_slack(jax.lax.stop_gradient(jnp.where((factor == 0) | (slope == 0), 0, lost)), before)
+
+
+def added_slack(a: Any, b: Any, total: Any) -> Any:
+    """What the sum of two slopes loses: nothing where one of them is 0."""
+    if not rounding.outward():
+        return None
+    if is_known(total):
+        low, high = rounding.known_sum(a, b)
+        return high - low
+    kind = np.dtype(total.dtype).type
+    lost = abs(total) * kind(2 * jnp.finfo(total.dtype).eps)
+    return jax.lax.stop_gradient(jnp.where((a == 0) | (b == 0), 0, lost))
 
 
 def guard(a: Interval) -> Interval:
-    """After an overflow: a lower bound is never ``inf``, an upper bound never ``-inf``."""
+    """After an overflow: a lower bound is never ``inf``, an upper bound never ``-inf``; neither is NaN."""
     if is_known(a.lower) and is_known(a.upper) and np.isfinite(a.lower).all() and np.isfinite(a.upper).all():
         return a
+    if rounding.outward():
+        return Interval.unchecked(rounding.unbounded(a.lower, -jnp.inf), rounding.unbounded(a.upper, jnp.inf))
     largest = jnp.finfo(a.lower.dtype).max
     return Interval.unchecked(jnp.minimum(a.lower, largest), jnp.maximum(a.upper, -largest))
 
@@ -179,32 +314,41 @@ def meet(node: Node) -> Node:
     return Node(choose(lower <= upper, Interval.unchecked(lower, upper), natural), node.form, node.jac)
 
 
-def best_form(slope: Any, offset: Interval, natural: Interval, box: Interval) -> Form:
+def best_form(slope: Any, offset: Interval, natural: Interval, box: Domain, slack: Any = None, size: Any = 0) -> Form:
     """The form with this slope, or slope 0 with the natural range where that one is narrower.
 
     A slope that overflowed needs no care here: its image is not a number, which never enters a range, and the
-    finished form is given slope 0.
+    finished form is given slope 0. `size` is the sum of what the rounding of the offset was taken from.
     """
     width = offset.upper - offset.lower
     # At width 0 both are equally good but for rounding, and there the slope must not be lost.
-    rounding = 8 * jnp.finfo(width.dtype).eps * (jnp.abs(offset.lower) + jnp.abs(natural.lower))
-    good = jnp.isfinite(width) & (width - rounding <= natural.upper - natural.lower)
-    return Form(jnp.where(good, slope, 0), choose(good, offset, natural), box)
+    size = jnp.abs(offset.lower) + jnp.abs(natural.lower) + size
+    loss = _LOSS * jnp.finfo(width.dtype).eps * jax.lax.stop_gradient(size)
+    good = jnp.isfinite(width) & (width - loss <= natural.upper - natural.lower)
+    slack = None if slack is None else jnp.where(good, slack, 0)
+    return Form(jnp.where(good, slope, 0), choose(good, offset, natural), box, slack)
 
 
 def settle(node: Node) -> Node:
-    """Last word on the result of every arithmetic rule, in all three domains: the place to widen for rounding."""
+    """Last word on the result of every arithmetic rule, in all three domains: what overflowed is unbounded."""
     if not jnp.issubdtype(node.dtype, jnp.floating):
         return node
     form, jac = node.form, node.jac
     if form is not None:
-        form = Form(form.slope, guard(form.offset), form.box)
+        form = Form(form.slope, guard(form.offset), form.box, form.slack)
     return Node(guard(node.range), form, None if jac is None else guard(jac))
 
 
 def as_node(value: Any, shape: tuple[int, ...], dtype: Any) -> Node:
     """A constant as a node of one point."""
     value = known_if_concrete(value)
+    if is_known(value) and np.issubdtype(value.dtype, np.floating) and np.issubdtype(dtype, np.floating):
+        value = value.astype(dtype)
+        tiny = np.finfo(value.dtype).tiny
+        # Compiled code would take a subnormal number for zero.
+        if ((value != 0) & (np.abs(value) < tiny)).any():
+            ends = rounding.normal(value, value)
+            return Node(Interval.unchecked(*(np.broadcast_to(end, shape) for end in ends)))
     value = np.broadcast_to(value, shape) if is_known(value) else jnp.broadcast_to(value, shape)
     value = value if value.dtype == bool else value.astype(dtype)
     return Node(Interval.unchecked(value, value))
@@ -220,10 +364,16 @@ def parts(values: Any) -> tuple[Any, Any]:
     return box, jac
 
 
-def slope_of(node: Node, box: Interval) -> Any:
+def slope_of(node: Node, box: Domain) -> Any:
     if node.form is not None:
         return node.form.slope
     return np.zeros((box.lower.shape[0], *node.shape), node.dtype)
+
+
+def slack_of(node: Node, slope: Any) -> Any:
+    """Slack of `slope_of`, zeros where it is exact."""
+    slack = None if node.form is None else node.form.slack
+    return np.zeros(np.shape(slope), node.dtype) if slack is None else slack
 
 
 def jac_of(node: Node, size: int) -> Interval:

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.api import _typed, jacobian, natural
+from gsisio_jax import rounding
+from gsisio_jax.inclusion.api import _typed, distance, jacobian, natural
 from gsisio_jax.inclusion.node import guard, times
 from gsisio_jax.interval import Interval, is_concrete
 
@@ -17,7 +18,7 @@ from gsisio_jax.interval import Interval, is_concrete
 def room(a: Any, b: Any, behind: Any, ahead: Any) -> Any:
     """How far f can fall below its value at a point, if its box reaches back by `behind` and on by `ahead`; summands.
 
-    With the two distances exchanged, how far it can rise. The place to widen for rounding.
+    With the two distances exchanged, how far it can rise. To nearest: the sum is what gets widened.
     """
     return jnp.maximum(jnp.maximum(times(-a, ahead), times(b, behind)), 0)
 
@@ -74,8 +75,8 @@ class Rows:
         self.count = sum(int(np.prod(shape)) for shape in self._shapes)
 
     def _value(self, point: Any) -> Any:
-        """f at a point, as a tree of boxes: wider than a point only for arguments that are boxes."""
-        if self.has_boxes:
+        """f at a point, as a tree of boxes: as wide as rounding and arguments that are boxes make them."""
+        if self.has_boxes or rounding.outward():
             return natural(self.f)(Interval.unchecked(point, point), *self.args)
         dtype = self.box.dtype
 
@@ -84,7 +85,6 @@ class Rows:
             return arg.astype(dtype) if jnp.issubdtype(arg.dtype, jnp.floating) else arg
 
         value = self.f(point, *jax.tree.map(convert, self.args))
-        # Rounding of f itself is not bounded here: the place to widen.
         return jax.tree.map(lambda v: Interval.unchecked(*[jnp.asarray(v).astype(dtype)] * 2), value)
 
     def values(self, points: Any) -> Interval:
@@ -113,9 +113,12 @@ class Rows:
 
         Never NaN: where f has no value at a point of its own, that point says nothing.
         """
-        behind, ahead = points - self.box.lower, self.box.upper - points
-        lower = value.lower - room(a, b, behind, ahead).sum(-1)
-        upper = value.upper + room(a, b, ahead, behind).sum(-1)
+        behind, ahead = -distance(self.box, points).lower, distance(self.box, points).upper
+        fall, rise = room(a, b, behind, ahead), room(a, b, ahead, behind)
+        lower, upper = value.lower - fall.sum(-1), value.upper + rise.sum(-1)
+        terms = points.shape[-1] + 4.0
+        lower = rounding.lowered(lower, abs(value.lower) + fall.sum(-1), terms, terms)
+        upper = rounding.raised(upper, abs(value.upper) + rise.sum(-1), terms, terms)
         return jnp.where(jnp.isnan(lower), -jnp.inf, lower), jnp.where(jnp.isnan(upper), jnp.inf, upper)
 
     def derivative(self, given: Any = None) -> tuple[Any, Any]:

@@ -6,12 +6,14 @@ it returns a node, or a list of them for a primitive with several results.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.inclusion import bilinear, curves, linear, logic, univariate
 from gsisio_jax.inclusion.node import Node, is_node
@@ -34,10 +36,10 @@ class UnknownPrimitiveError(ValueError):
 Rule = Callable[..., Any]
 
 
-def _structural(*data: int) -> Rule:
+def _structural(*data: int, terms: Callable[[Any], int] = lambda eqn: 1) -> Rule:
     """Rule for a primitive that moves entries about or sums them; `data` are its arguments that are values.
 
-    The others (indices) must be constants. No numbers: all arguments are values.
+    The others (indices) must be constants. No numbers: all arguments are values. `terms` says how many it adds at most.
     """
 
     def rule(eqn: Any, *args: Any) -> Any:
@@ -52,7 +54,7 @@ def _structural(*data: int) -> Rule:
             return eqn.primitive.bind(*fixed, **eqn.params)
 
         rest = [arg for i, arg in enumerate(args) if i not in where]
-        nodes = linear.structural(call, [args[i] for i in where], rest)
+        nodes = linear.structural(call, [args[i] for i in where], rest, terms(eqn))
         return nodes if eqn.primitive.multiple_results else nodes[0]
 
     return rule
@@ -81,7 +83,7 @@ def _mul(eqn: Any, x: Any, y: Any) -> Node:
 
 
 def _sub(eqn: Any, x: Any, y: Any) -> Any:
-    return jnp.zeros(x.shape, x.dtype) if _same(eqn) else linear.subtract(x, y)
+    return np.zeros(x.shape, x.dtype) if _same(eqn) else linear.subtract(x, y)
 
 
 def _relation(fn: Callable[..., Node], reflexive: bool) -> Rule:
@@ -95,6 +97,11 @@ def _convert(eqn: Any, x: Node) -> Node:
     """Between floating types the bounds follow; an integer is carried as the floating number it is."""
     target = eqn.params["new_dtype"]
     if jnp.issubdtype(target, jnp.floating):
+        if jnp.issubdtype(x.dtype, jnp.floating) and jnp.finfo(target).bits < jnp.finfo(x.dtype).bits:
+            # Bounds are those of the number before it is rounded to the narrower type, as for every other operation.
+            narrow = x.range.astype(target)
+            jac = None if x.jac is None else x.jac.astype(target)
+            return Node(narrow, None, jac)
         return linear.move(lambda v: v.astype(target), x)
     if x.dtype == jnp.bool_:
         return x if target == jnp.bool_ else linear.move(lambda v: v.astype(jnp.result_type(float)), x)
@@ -131,6 +138,10 @@ def _running(fn: Callable[[Any, Any], Node]) -> Rule:
         return linear.structural(lambda *v: jnp.concatenate(v, axis), items)[0] if count > 1 else x
 
     return rule
+
+
+def _scattered(eqn: Any) -> int:
+    return 1 + math.prod(eqn.invars[2].aval.shape)
 
 
 def _truth_reduce(fn: Callable[..., Any]) -> Rule:
@@ -187,11 +198,16 @@ REDUCTIONS: dict[str, Rule] = {
     "cumprod": _running(bilinear.multiply),
     "cummax": _running(logic.maximum),
     "cummin": _running(logic.minimum),
-    "scatter-add": _structural(0, 2),
-    "scatter_add": _structural(0, 2),
-    "cumsum": _structural(),
+    "scatter-add": _structural(0, 2, terms=_scattered),
+    "scatter_add": _structural(0, 2, terms=_scattered),
+    "cumsum": _structural(terms=lambda eqn: eqn.invars[0].aval.shape[eqn.params["axis"]]),
 }
 ELEMENTWISE |= {name: _curve(name) for name in curves.CURVES}
+# Of these the result is not exact even where the arguments are.
+ROUNDED = {
+    "add", "add_any", "sub", "mul", "div", "rem", "pow", "integer_pow", "atan2", "dot_general", "reduce_sum",
+    "reduce_prod", "cumprod", "scatter-add", "scatter_add", "cumsum", *curves.CURVES,
+} - {"abs"}  # fmt: skip
 # Results of these need no widening: they only move numbers about, or their insides have been through it.
 MOVES: dict[str, Rule] = {
     name: _structural(*data)

@@ -10,7 +10,13 @@ The slope is always the derivative at some point m, so the critical points of ``
 solving anything: m itself and, where the derivative is an even function, -m. By the envelope theorem they can be held
 fixed when a gradient is taken.
 
-Source: design 5.
+Rounding. Values of the function are padded by `ulps` of the table (`curves`). For the rest, any slope is sound, so let
+s be the number that was computed, and ``s + e`` the exact derivative at m, ``|e| <= ulps eps |s| + tiny``. The
+extremes of ``phi(t) - (s + e) t`` over [a, b] lie among the points looked at, so those of ``phi(t) - s t`` differ from
+the values there by at most ``|e| (b - a)``; that, the rounding of ``phi(t_i)`` and that of ``s t_i`` are what `_rest`
+adds.
+
+Source: design 5 and 6.
 """
 
 from __future__ import annotations
@@ -24,24 +30,36 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.node import Node, best_form, product, shift, stretch
+from gsisio_jax import rounding
+from gsisio_jax.inclusion.elementary import LIMIT, SLOT, sin_cos
+from gsisio_jax.inclusion.node import Node, best_form, guard, product, scaled_slack, slope_reach, times
 from gsisio_jax.interval import Interval, choose, entire_like, larger, smaller
 
 INF = math.inf
 # Below this relative width a secant is mostly rounding; the tangent at the middle is as good there.
 _NARROW = 1e-3
+_PERIOD = 6.28  # a little less than 2 pi
+_PLAIN = (-1.0, 0.0, 0.25, 1.0, 2.0)  # limits of functions that are numbers of any precision
 
 
 def apply(curve: Any, x: Node) -> Node:
     """Apply a function of one variable to a node, in all domains."""
     a, b = x.range.lower, x.range.upper
-    natural = curve.range(a, b)
+    natural = guard(curve.range(a, b))
     form = None
     if x.form is not None:
-        slope, rest = curve.line(a, b, natural)
-        offset = shift(stretch(slope, x.form.offset), rest)
-        form = best_form(slope * x.form.slope, offset, natural, x.form.box)
-    jac = None if x.jac is None else product(curve.derivative(a, b), x.jac)
+        s, rest = curve.line(a, b, natural)
+        slope, offset = s * x.form.slope, x.form.offset
+        up = s >= 0
+        first, last = (times(s, jnp.where(mask, offset.lower, offset.upper)) for mask in (up, ~up))
+        lower, upper, size, slack = first + rest.lower, last + rest.upper, 0, None
+        if rounding.outward():
+            lower = rounding.lowered(lower, abs(first) + abs(lower), 2.0)
+            upper = rounding.raised(upper, abs(last) + abs(upper), 2.0)
+            slack = scaled_slack(s, x.form.slope, slope, x.form.slack)
+            size = slope_reach(slope, x.form.box)
+        form = best_form(slope, Interval.unchecked(lower, upper), natural, x.form.box, slack, size)
+    jac = None if x.jac is None else product(guard(curve.derivative(a, b)), x.jac)
     return Node(natural, form, jac)
 
 
@@ -65,6 +83,9 @@ class Piece:
         domain: where the function is defined.
         inner: a point inside the domain, evaluated in place of points outside so that gradients stay finite.
         reach: given the largest number of the floating type, from where on ``ends`` is used.
+        ulps: bound of the error of `fn` in eps of its value, see `curves`.
+        drift: what is to be added to `ulps` for an argument of that magnitude, nondecreasing.
+        floor: bound of what is lost where intermediate results are flushed to zero, in smallest normal numbers.
     """
 
     fn: Callable[[Any], Any]
@@ -74,6 +95,9 @@ class Piece:
     domain: tuple[float, float] = (-INF, INF)
     inner: float = 0.5
     reach: Callable[[float], float] | None = None
+    ulps: float = 4.0
+    drift: Callable[[Any], Any] | None = None
+    floor: float = 16.0
 
     def at(self, t: Any) -> Any:
         """Value at t, the limit at and beyond the ends of the domain."""
@@ -90,7 +114,7 @@ class Piece:
         return jnp.where(inside, value, limit)
 
     def range(self, a: Any, b: Any) -> Interval:
-        """Exact range on ``[a, b]``; everything where that interval misses the domain."""
+        """Exact range on ``[a, b]``, padded; everything where that interval misses the domain."""
         pa, pb = self.at(a), self.at(b)
         if self.trend == "up":
             result = Interval.unchecked(pa, pb)
@@ -102,10 +126,47 @@ class Piece:
                 result = Interval.unchecked(jnp.where(turns, self.turn, result.lower), result.upper)
             else:
                 result = Interval.unchecked(result.lower, jnp.where(turns, self.turn, result.upper))
+        result = self._padded(result, self.ulps_on(a, b))
         low, high = self.domain
         if low > -INF or high < INF:
             result = choose((b < low) | (a > high), entire_like(pa), result)
         return result
+
+    def ulps_on(self, a: Any, b: Any) -> Any:
+        """Error of `fn` on [a, b], in eps of its value."""
+        if self.drift is None:
+            return self.ulps
+        return jax.lax.stop_gradient(self.ulps + self.drift(jnp.maximum(abs(a), abs(b))))
+
+    def _padded(self, exact: Interval, ulps: Any) -> Interval:
+        """Outward by `ulps`, but not beyond the limits of the function where these are numbers of any precision."""
+        if not rounding.outward():
+            return exact
+        limits = (*self.ends, self.turn) if self.trend in ("valley", "peak") else self.ends
+        lowest, highest = min(limits), max(limits)
+        lower, upper = exact.lower, exact.upper
+        # What lies beyond the largest number is no better known than that.
+        lower = rounding.overflowed(lower) if highest == INF else lower
+        upper = -rounding.overflowed(-upper) if lowest == -INF else upper
+        lower, upper = rounding.down(lower, ulps, self.floor), rounding.up(upper, ulps, self.floor)
+        if lowest in _PLAIN:
+            lower = jnp.maximum(lower, lowest)
+        if highest in _PLAIN:
+            upper = jnp.minimum(upper, highest)
+        return Interval.unchecked(lower, upper)
+
+
+def _rest(values: list[Any], ends: tuple[Any, Any], s: Any, far: Any, ulps: Any) -> Interval:
+    """Extremes of ``phi(t_i) - s t_i``, padded: `ends` are phi(a) and phi(b), between which all phi(t_i) lie (or
+    between 0 and them), `far` the largest of |a| and |b|."""
+    rest = extremes(values)
+    if not rounding.outward():
+        return rest
+    # 2 ulps for e (b - a) with b - a <= 2 far, two roundings, and as much again.
+    size = jnp.maximum(abs(ends[0]), abs(ends[1])) + (3 * abs(s) + float(jnp.finfo(s.dtype).tiny)) * far
+    return Interval.unchecked(
+        rounding.lowered(rest.lower, size, ulps + 4, 32.0), rounding.raised(rest.upper, size, ulps + 4, 32.0)
+    )
 
 
 @dataclass(frozen=True)
@@ -115,6 +176,14 @@ class Curve:
     phi: Piece
     slope: Piece
     contact: Callable[[Any], Any] | None = None
+
+    @property
+    def ulps(self) -> float:
+        return max(self.phi.ulps, self.slope.ulps)
+
+    @property
+    def drifts(self) -> bool:
+        return self.phi.drift is not None or self.slope.drift is not None
 
     def range(self, a: Any, b: Any) -> Interval:
         return self.phi.range(a, b)
@@ -147,46 +216,65 @@ class Curve:
         m = jax.lax.stop_gradient(m)
         for t in (m, -m) if even else (m,):
             values.append(jnp.where((a <= t) & (t <= b), jax.lax.stop_gradient(self.phi.at(t)) - s * t, first))
-        return s, choose(usable, extremes(values), natural)
+        far = jnp.maximum(abs(a), abs(b))
+        ulps = jnp.maximum(self.phi.ulps_on(a, b), self.slope.ulps_on(a, b)) if self.drifts else self.ulps
+        rest = _rest(values, (pa, pb), s, far, ulps)
+        return s, choose(usable, rest, natural)
 
 
 @dataclass(frozen=True)
 class Wave:
-    """``sin`` or ``cos``: crests at ``crest + 2 k pi``.
+    """``sin`` or ``cos``.
 
     Everything follows from the middle m and the half-width r alone: ``phi(m + h) = phi(m) cos h + phi'(m) sin h``.
     Range and line then share four sines and cosines, which are what a wave costs.
     """
 
-    fn: Callable[[Any], Any]
-    slope: Callable[[Any], Any]
-    crest: float
-    slope_crest: float
+    cosine: bool
 
     def range(self, a: Any, b: Any) -> Interval:
-        return _wave_range(self.fn, self.slope, self.crest, a, b)
+        return _wave_range(self.cosine, 1.0, a, b)
 
     def derivative(self, a: Any, b: Any) -> Interval:
-        return _wave_range(self.slope, lambda t: -self.fn(t), self.slope_crest, a, b)
+        return _wave_range(not self.cosine, -1.0 if self.cosine else 1.0, a, b)
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
-        usable = b - a < 2 * np.pi
-        m, r = _middle(usable, a, b)
-        value, steepness = self.fn(m), self.slope(m)
-        half_sin, half_cos = jnp.sin(0.5 * r), jnp.cos(0.5 * r)
+        usable, m, r = _middle(a, b)
+        sine, cosine = sin_cos(m)
+        value, steepness = (cosine, -sine) if self.cosine else (sine, cosine)
+        half_sin, half_cos = sin_cos(0.5 * r)
         # With slope phi'(m) cos(r/2) the odd part of the rest, sin h - h cos(r/2), has its critical points at
         # +-r/2. It is then four times smaller than with the tangent, and no arccosine is needed.
         s = steepness * half_cos
         odd = jnp.abs(steepness) * jnp.maximum(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
-        even = value * (2 * half_cos**2 - 1)
-        rest = Interval.unchecked(jnp.minimum(value, even) - odd - s * m, jnp.maximum(value, even) + odd - s * m)
+        even = value * (1 - 2 * half_sin**2)
+        shift = s * m
+        lower, upper = jnp.minimum(value, even) - odd - shift, jnp.maximum(value, even) + odd - shift
+        rest = _wave_padded(Interval.unchecked(lower, upper), self.cosine, m, r)
         return jnp.where(usable, s, 0), choose(usable, rest, natural)
 
 
-def _middle(usable: Any, a: Any, b: Any) -> tuple[Any, Any]:
-    """Middle and half-width, 0 where they are not usable."""
+def _middle(a: Any, b: Any) -> tuple[Any, Any, Any]:
+    """Is [a, b] within less than a period and near enough for `sin_cos`; middle and half-width, 0 where it is not."""
+    usable = (b - a < _PERIOD) & (abs(a) < LIMIT[a.dtype.name]) & (abs(b) < LIMIT[a.dtype.name])
     a, b = jnp.where(usable, a, 0), jnp.where(usable, b, 0)
-    return 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
+    return usable, 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
+
+
+def _wave_padded(exact: Interval, cosine: bool, m: Any, r: Any) -> Interval:
+    """Outward by what the formulas of `Wave` lose.
+
+    With SLOT = 2, `sin_cos` is off by 2 eps at most, and by ``3 eps |t|`` in the sine. m and r are off by ``eps (|m| +
+    r)`` together, and the derivative of every bound here by m or r is at most 2 in magnitude. Every product of two or
+    three such values, and sum of three, stays below ``14 eps (k + |m| + r)``, k = 1 for a cosine and 0 for a sine,
+    which vanishes with m and r. A crest that rounding hides lies within ``4 eps (|m| + r)`` of an end: half of the
+    square of that is what the value there misses, below ``eps`` times this again within `LIMIT`.
+    """
+    if not rounding.outward():
+        return exact
+    size = abs(m) + r + (1.0 if cosine else 0.0)
+    radius = rounding.error(size, 8 * SLOT)
+    return Interval.unchecked(exact.lower - radius, exact.upper + radius)
 
 
 def _crosses(phase: float, period: float, a: Any, b: Any) -> Any:
@@ -194,36 +282,54 @@ def _crosses(phase: float, period: float, a: Any, b: Any) -> Any:
     return jnp.ceil((a - phase) / period) <= (b - phase) / period
 
 
-def _wave_range(fn: Callable[[Any], Any], slope: Callable[[Any], Any], crest: float, a: Any, b: Any) -> Interval:
-    usable = b - a < 2 * np.pi
-    m, r = _middle(usable, a, b)
-    half_sin, half_cos = jnp.sin(0.5 * r), jnp.cos(0.5 * r)
-    even, odd = fn(m) * (2 * half_cos**2 - 1), jnp.abs(slope(m)) * 2 * half_sin * half_cos
+def _wave_range(cosine: bool, sign: float, a: Any, b: Any) -> Interval:
+    """Range of ``sign`` times the sine or the cosine."""
+    usable, m, r = _middle(a, b)
+    sine, other = sin_cos(m)
+    value, steepness = (other, sine) if cosine else (sine, other)
+    half_sin, half_cos = sin_cos(0.5 * r)
+    even, odd = sign * value * (1 - 2 * half_sin**2), jnp.abs(steepness) * 2 * half_sin * half_cos
     a, b = m - r, m + r
+    crest = (0.0 if cosine else np.pi / 2) + (np.pi if sign < 0 else 0.0)
     top = ~usable | _crosses(crest, 2 * np.pi, a, b)
     bottom = ~usable | _crosses(crest + np.pi, 2 * np.pi, a, b)
-    return Interval.unchecked(jnp.where(bottom, -1, even - odd), jnp.where(top, 1, even + odd))
+    found = _wave_padded(Interval.unchecked(even - odd, even + odd), cosine, m, r)
+    lower, upper = jnp.where(bottom, -1, found.lower), jnp.where(top, 1, found.upper)
+    return Interval.unchecked(jnp.maximum(lower, -1), jnp.minimum(upper, 1))
 
 
 @dataclass(frozen=True)
 class Tangent:
-    """``tan``, with its poles."""
+    """``tan``, with its poles. Padded by `ulps`, which holds away from poles by more than rounding can hide."""
+
+    ulps: float = 64.0
 
     def _inside(self, a: Any, b: Any) -> tuple[Any, Any, Any]:
-        whole = jnp.isfinite(a) & jnp.isfinite(b)
+        limit = LIMIT[a.dtype.name]
+        whole = (abs(a) < limit) & (abs(b) < limit)
         a, b = jnp.where(whole, a, 0), jnp.where(whole, b, 0)
-        whole &= ~_crosses(np.pi / 2, np.pi, a, b)
+        lower, upper = self._blurred(a, b)
+        whole &= ~_crosses(np.pi / 2, np.pi, lower, upper)
         return whole, jnp.where(whole, a, 0), jnp.where(whole, b, 0)
+
+    def _blurred(self, a: Any, b: Any) -> tuple[Any, Any]:
+        """A little more than [a, b]: multiples of pi are known to that accuracy only."""
+        if not rounding.outward():
+            return a, b
+        margin = rounding.error(jnp.maximum(abs(a), abs(b)) + 1, 16.0)
+        return a - margin, b + margin
 
     def range(self, a: Any, b: Any) -> Interval:
         whole, a, b = self._inside(a, b)
-        return choose(whole, Interval.unchecked(jnp.tan(a), jnp.tan(b)), entire_like(a))
+        lower, upper = rounding.down(jnp.tan(a), self.ulps), rounding.up(jnp.tan(b), self.ulps)
+        return choose(whole, Interval.unchecked(lower, upper), entire_like(a))
 
     def derivative(self, a: Any, b: Any) -> Interval:
         whole, a, b = self._inside(a, b)
-        flat = _crosses(0.0, np.pi, a, b)
+        flat = _crosses(0.0, np.pi, *self._blurred(a, b))
         steep = extremes([1 + jnp.tan(a) ** 2, 1 + jnp.tan(b) ** 2])
-        steep = Interval.unchecked(jnp.where(flat, 1, steep.lower), steep.upper)
+        lower = jnp.maximum(rounding.down(steep.lower, 2 * self.ulps + 4), 1)
+        steep = Interval.unchecked(jnp.where(flat, 1, lower), rounding.up(steep.upper, 2 * self.ulps + 4))
         return choose(whole, steep, entire_like(a))
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
@@ -233,10 +339,14 @@ class Tangent:
         m = jax.lax.stop_gradient(m)
         mirror = 2 * np.pi * jnp.round(m / np.pi) - m
         pm = jax.lax.stop_gradient(jnp.tan(m))
-        first = jnp.tan(a) - s * a
-        inside = (a <= mirror) & (mirror <= b)
-        values = [first, jnp.tan(b) - s * b, pm - s * m, jnp.where(inside, -pm - s * mirror, first)]
-        return jnp.where(whole, s, 0), choose(whole, extremes(values), natural)
+        pa, pb = jnp.tan(a), jnp.tan(b)
+        first = pa - s * a
+        lower, upper = self._blurred(a, b)
+        inside = (lower <= mirror) & (mirror <= upper)
+        values = [first, pb - s * b, pm - s * m, jnp.where(inside, -pm - s * mirror, first)]
+        # The mirror image of m is off by a few eps (|m| + 1), which counts s times.
+        far = jnp.maximum(abs(a), abs(b)) + 1
+        return jnp.where(whole, s, 0), choose(whole, _rest(values, (pa, pb), s, far, 2 * self.ulps + 16), natural)
 
 
 @dataclass(frozen=True)
@@ -256,19 +366,26 @@ class Pole:
         inside = (t > 0) & jnp.isfinite(t)
         return jnp.where(inside, jnp.where(inside, t, 1) ** -k, jnp.where(t > 0, 0, INF))
 
+    def _between(self, far: Any, near: Any, k: int) -> tuple[Any, Any]:
+        """``far ** -k`` rounded down and ``near ** -k`` rounded up; k multiplications and a division, and as many again
+        for a multiple of them."""
+        low = rounding.overflowed(self._power(far, k))
+        low, high = rounding.down(low, 2.0 * k + 4), rounding.up(self._power(near, k), 2.0 * k + 4)
+        return jnp.maximum(low, 0), high
+
     def range(self, a: Any, b: Any) -> Interval:
         split, left, near, far = self._side(a, b)
-        low, high = self._power(far, self.k), self._power(near, self.k)
+        low, high = self._between(far, near, self.k)
         if self.k % 2:
             result = Interval.unchecked(jnp.where(left, -high, low), jnp.where(left, -low, high))
             return choose(split, entire_like(a), result)
         # An even pole inside: bounded below by the value at the end that is farther from 0.
-        far = jnp.maximum(-a, b)
-        return Interval.unchecked(jnp.where(split, self._power(far, self.k), low), jnp.where(split, INF, high))
+        low = jnp.where(split, self._between(jnp.maximum(-a, b), near, self.k)[0], low)
+        return Interval.unchecked(low, jnp.where(split, INF, high))
 
     def derivative(self, a: Any, b: Any) -> Interval:
         split, left, near, far = self._side(a, b)
-        low, high = self.k * self._power(far, self.k + 1), self.k * self._power(near, self.k + 1)
+        low, high = (self.k * value for value in self._between(far, near, self.k + 1))
         if self.k % 2:
             result = Interval.unchecked(-high, -low)
         else:
@@ -284,8 +401,10 @@ class Pole:
         usable &= jnp.isfinite(s) & (m != 0)
         s = jnp.where(usable, s, 0)
         m = jax.lax.stop_gradient(m)
-        values = [a**-self.k - s * a, b**-self.k - s * b, jax.lax.stop_gradient(m**-self.k) - s * m]
-        return s, choose(usable, extremes(values), natural)
+        pa, pb = a**-self.k, b**-self.k
+        values = [pa - s * a, pb - s * b, jax.lax.stop_gradient(m**-self.k) - s * m]
+        rest = _rest(values, (pa, pb), s, jnp.maximum(abs(a), abs(b)), 2.0 * self.k + 6)
+        return s, choose(usable, rest, natural)
 
 
 @dataclass(frozen=True)
@@ -311,7 +430,8 @@ class Hinge:
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
         low, high = jnp.isfinite(a), jnp.isfinite(b)
         bent = (a < 0) & (b > 0)
-        cut = bent & low & high
+        # Narrower than this, a secant has no gradient; any slope is as good.
+        cut = bent & low & high & (b - a > float(jnp.finfo(a.dtype).tiny) ** 0.25)
         a0, b0 = jnp.where(cut, a, -1), jnp.where(cut, b, 1)
         s = (b0 - self.left * a0) / (b0 - a0)
         # With one end infinite the slope of the infinite side leaves a bounded rest; with both, nothing does.
@@ -320,5 +440,9 @@ class Hinge:
         rest_a = jnp.where(low & bent, (self.left - s) * jnp.where(low, a, 0), 0)
         rest_b = jnp.where(high & bent, (1 - s) * jnp.where(high, b, 0), 0)
         rest = extremes([rest_a, rest_b, jnp.zeros_like(rest_a)])
+        if rounding.outward():
+            # Linear on either side of 0, where it is 0, so only the two products round; and only where s is no integer.
+            loss = jnp.where(cut, rounding.error(4 * jnp.maximum(abs(a0), abs(b0))), 0)
+            rest = Interval.unchecked(rest.lower - loss, rest.upper + loss)
         both = bent & ~low & ~high
         return jnp.where(both, 0, s), choose(both, natural, rest)
