@@ -18,6 +18,7 @@ SIZES = {  # full, quick
     "compiled": ({"batch": 100_000, "steps": 100}, {"batch": 5_000, "steps": 50}),
     "numpy": ({"batch": 2_000, "steps": 100}, {"batch": 1_000, "steps": 20}),
     "tanks": ({"steps": 100}, {"steps": 50}),
+    "study": ({"boxes": 1000, "levels": 1000, "steps": 100}, {"boxes": 100, "levels": 100, "steps": 50}),
     "rounding": ({"batch": 20_000, "steps": 100}, {"batch": 2_000, "steps": 50}),
 }
 
@@ -29,6 +30,7 @@ def cases(quick: bool) -> dict[str, tuple[str, str, dict[str, Any]]]:
         "throughput final widths": ("throughput", "final_widths", size["compiled"]),
         "throughput all boxes": ("throughput", "all_boxes", size["compiled"]),
         "throughput NumPy": ("throughput", "numpy", size["numpy"]),
+        "study sweep": ("studies", "sweep", size["study"]),
         **{
             f"rounding {plant} {dtype}": ("rounding", "compare", {"plant": plant, "dtype": dtype, **size["rounding"]})
             for plant in ("s1", "s5")
@@ -122,6 +124,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         peak = f"{r['peak_mebibytes']:,.0f} MiB" if "peak_mebibytes" in r else ""
         notes = [r.get("error") or ("passed" if r["ok"] else "FAILED")]
         notes += [f"agrees to {r['gap']:.0e}"] if "gap" in r else []
+        notes += [f"{r['to_bare']:.2f} of the rate of the bare kernel"] if "to_bare" in r else []
         notes += [f"outward / nearest {r['cost']:.2f}, wider by {r['inflation']:.1e}"] if "cost" in r else []
         notes += [f"design {r['design_seconds']:.1f} s"] if "design_seconds" in r else []
         left = f"{name:<26}{size:>16}{run:>10}{cpu:>10}{build:>10}{rate:>14}"

@@ -84,7 +84,7 @@ def _compiled(batch: int, steps: int, keep: Callable[[Any], Any]) -> dict[str, A
     observer = plant.design(missing=False)
     initial, y, x = records(plant, batch)
     run = jax.jit(jax.vmap(lambda box, y: keep(gx.estimate(observer, box, y))))
-    before = _peak()
+    before = peak()
     args = jax.device_put((initial, y))
     started = time.perf_counter()
     program = run.lower(*args).compile()
@@ -92,8 +92,10 @@ def _compiled(batch: int, steps: int, keep: Callable[[Any], Any]) -> dict[str, A
     started = time.perf_counter()
     result = jax.block_until_ready(program(*args))
     repeats = 1 if time.perf_counter() - started > LONG else REPEATS
-    seconds, cpu_seconds = min(_timed(program, args) for _ in range(repeats))
-    peak = _peak() - before
+    _, seconds, cpu_seconds = min(
+        (timed(lambda: jax.block_until_ready(program(*args))) for _ in range(repeats)), key=lambda all: all[1]
+    )
+    used = peak() - before
     return {
         "batch": batch,
         "steps": steps,
@@ -101,7 +103,7 @@ def _compiled(batch: int, steps: int, keep: Callable[[Any], Any]) -> dict[str, A
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "rate": batch * steps / seconds,
-        "peak_mebibytes": peak / 2**20,
+        "peak_mebibytes": used / 2**20,
         **_checked(run, observer, args, x, result),
     }
 
@@ -120,13 +122,13 @@ def _checked(run: Any, observer: Any, args: Any, x: np.ndarray, result: Any) -> 
     return {"sound": sound, "gap": gap, "ok": sound and gap < AGREEMENT and bool(np.isfinite(result).all())}
 
 
-def _timed(program: Any, args: Any) -> tuple[float, float]:
-    """Wall and processor time of one call; where the second is far below the first times the cores, others compute."""
+def timed(call: Callable[[], Any]) -> tuple[Any, float, float]:
+    """Result, wall and processor time; where the second is far below the first times the cores, others compute."""
     started, cpu = time.perf_counter(), time.process_time()
-    jax.block_until_ready(program(*args))
-    return time.perf_counter() - started, time.process_time() - cpu
+    result = call()
+    return result, time.perf_counter() - started, time.process_time() - cpu
 
 
-def _peak() -> float:
+def peak() -> float:
     """Largest resident set of this process so far, in bytes (Linux counts kibibytes)."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0

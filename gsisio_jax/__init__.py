@@ -5,18 +5,20 @@ from typing import TYPE_CHECKING, Any
 from gsisio_jax import estimation, inclusion
 from gsisio_jax.alarms import Alarm
 from gsisio_jax.certificate import Certificate
-from gsisio_jax.errors import FramerNotGuaranteed, NoDesignFound, ObserverDoesNotExist
+from gsisio_jax.errors import ContainmentLost, FramerNotGuaranteed, NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.estimation import Estimate, estimate, start, step
 from gsisio_jax.interval import Interval, hull, intersect, linear_image
 from gsisio_jax.observer import Carry, Observer, StepOutput
 from gsisio_jax.prediction import PredictionObserver
+from gsisio_jax.simulation import Simulation, simulate
 from gsisio_jax.status import Status
-from gsisio_jax.system import Noise, Simulation, System, simulate
+from gsisio_jax.system import Noise, System
 
 if TYPE_CHECKING:
-    from gsisio_jax import dataset, examples, paper, plot, study
+    from gsisio_jax import dataset, examples, paper, plot, study, tuning
     from gsisio_jax.design import design_observer
-    from gsisio_jax.study import grid, sweep
+    from gsisio_jax.study import grid, monte_carlo, sweep
+    from gsisio_jax.tuning import allocate, tune_noise, width_sensitivity
 
 __version__ = "0.1.0"
 
@@ -24,6 +26,7 @@ __all__ = [
     "Alarm",
     "Carry",
     "Certificate",
+    "ContainmentLost",
     "Estimate",
     "FramerNotGuaranteed",
     "Interval",
@@ -36,6 +39,7 @@ __all__ = [
     "Status",
     "StepOutput",
     "System",
+    "allocate",
     "dataset",
     "design_observer",
     "estimate",
@@ -46,6 +50,7 @@ __all__ = [
     "inclusion",
     "intersect",
     "linear_image",
+    "monte_carlo",
     "paper",
     "plot",
     "simulate",
@@ -53,17 +58,25 @@ __all__ = [
     "step",
     "study",
     "sweep",
+    "tune_noise",
+    "tuning",
+    "width_sensitivity",
 ]
 
 _LAZY = {
+    "allocate": "gsisio_jax.tuning",
     "design_observer": "gsisio_jax.design",
     "grid": "gsisio_jax.study",
+    "monte_carlo": "gsisio_jax.study",
     "sweep": "gsisio_jax.study",
+    "tune_noise": "gsisio_jax.tuning",
+    "width_sensitivity": "gsisio_jax.tuning",
     "dataset": "",
     "examples": "",
     "paper": "",
     "plot": "",
     "study": "",
+    "tuning": "",
 }
 
 

@@ -1,4 +1,4 @@
-"""Errors of the offline design. All are `ValueError`s, so that one `except` clause serves a script."""
+"""Errors of the offline design and of studies. All are `ValueError`s, so that one `except` clause serves a script."""
 
 from __future__ import annotations
 
@@ -22,4 +22,11 @@ class FramerNotGuaranteed(ValueError):
     """The paper's recursion (prediction form) is no framer for this system: rho(|G||J1|) >= 1.
 
     ``allow_uncertified=True`` runs it all the same, to be looked at. Source: design 3, P3.
+    """
+
+
+class ContainmentLost(ValueError):
+    """A box of a simulated run does not hold the truth, or the run itself left the bounds that the boxes rely on.
+
+    The message names the run and the step, and how to do that run again. Source: design 11.
     """

@@ -233,6 +233,27 @@ def _scale_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any
     return scale(factor, value), d_factor * finite + factor * d_value
 
 
+@jax.custom_jvp
+def smaller(a: Any, b: Any) -> Any:
+    """``jnp.minimum(a, b)`` whose derivative is that of one of the two, for certain.
+
+    JAX finds out which one it was by comparing the minimum with both for equality. Where XLA computes a number twice
+    and rounds it differently, neither is equal, and the derivative is lost.
+    """
+    return jnp.minimum(a, b)
+
+
+@smaller.defjvp
+def _smaller_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+    (a, b), (da, db) = primals, tangents
+    return smaller(a, b), jnp.where(a <= b, da, db)
+
+
+def larger(a: Any, b: Any) -> Any:
+    """``jnp.maximum(a, b)`` with the derivative of `smaller`."""
+    return -smaller(-a, -b)
+
+
 def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
     """Bound the image of a box under a constant matrix (exact in real arithmetic).
 
@@ -271,7 +292,10 @@ def image(matrix: Any, x: Interval) -> Interval:
 def products(matrix: Any, x: Interval) -> tuple[Any, Any]:
     """Smallest and largest of every product in ``matrix @ x``, (..., m, n), to nearest; for `rounding.sum_down`."""
     at_lower, at_upper = scale(matrix, x.lower[..., None, :]), scale(matrix, x.upper[..., None, :])
-    return jnp.minimum(at_lower, at_upper), jnp.maximum(at_lower, at_upper)
+    # Sides are chosen by sign, not by min and max: those tie on boxes of width 0 and would halve the derivative of the
+    # width.
+    up = matrix >= 0
+    return jnp.where(up, at_lower, at_upper), jnp.where(up, at_upper, at_lower)
 
 
 def spread(matrix: Any, reach: Any) -> Any:

@@ -2,7 +2,8 @@
 
 One run reads like this: ``app`` parses the command line, ``config`` the TOML file, ``problem`` turns it into the
 library's objects, ``table`` reads the measurements, ``run`` calls the observer, ``output`` writes the files and
-``report`` prints the closing summary.
+``report`` prints the closing summary. A study goes the same way with ``study`` in the place of ``run``, its own tables
+(``study_config``), files and summary, and ``stopping`` for Ctrl-C.
 """
 
 from .app import main

@@ -11,29 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 from .._extras import MissingExtra, need
 from .errors import UserError, reason
+from .help import EXAMPLES, MONTE_CARLO, SWEEP
 
 if TYPE_CHECKING:
     from .config import Config
     from .problem import Problem
-
-EXAMPLES = """\
-examples:
-  gsisio estimate flight                     a built-in example; files go to results/flight
-  gsisio estimate pump.toml --out today      your own system and table
-  gsisio design pump.toml                    what the observer promises, without any data
-  gsisio reproduce                           the paper's example; files go to results/paper
-
-CONFIG is a TOML file. It names the system ("module:attribute", also a module beside the file), the
-noise bounds, the region, the initial box, the table of measurements (CSV or Parquet) and the outputs.
-The built-in examples are commented and meant to be copied.
-
-estimate writes three files: a labelled NetCDF, a CSV with the columns
-time,<signal>_lower,<signal>_upper,...,status  and a PNG. status is a sum of
-1 conflict (a certified alarm), 2 missing data, 4 unbounded, 8 outside the region, 16 crossed.
-
-exit codes: 0 done, 2 something in the command, the configuration, the table or the folder is wrong
-(one line says what, and no file is written), 130 interrupted.
-"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -67,7 +49,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    layout = {"epilog": EXAMPLES, "formatter_class": argparse.RawDescriptionHelpFormatter}
+    form = argparse.RawDescriptionHelpFormatter
+    layout = {"epilog": EXAMPLES, "formatter_class": form}
     parser = argparse.ArgumentParser(
         prog="gsisio", description="Guaranteed boxes for the states and the unknown inputs of a system.", **layout
     )
@@ -92,6 +75,18 @@ def _parser() -> argparse.ArgumentParser:
     design = commands.add_parser("design", parents=[common], help="print the certificate alone", **layout)
     design.set_defaults(command=_design)
 
+    for name, epilog, text, command in (
+        ("sweep", SWEEP, "widths over noise bounds, initial boxes and records, in a study that can be resumed", _sweep),
+        ("monte-carlo", MONTE_CARLO, "simulated runs, every box checked against the truth", _monte_carlo),
+    ):
+        study = commands.add_parser(name, parents=[common], help=text, epilog=epilog, formatter_class=form)
+        study.add_argument("--out", metavar="DIR", type=Path, help="folder of the files (default: results/NAME)")
+        study.add_argument("--fresh", action="store_true", help="begin anew: delete the stored study of an earlier run")
+        study.add_argument(
+            "--progress", choices=("auto", "never"), default="auto", help="progress bars; auto: only on a terminal"
+        )
+        study.set_defaults(command=command)
+
     reproduce = commands.add_parser(
         "reproduce", help="the paper's example: every printed number beside the computed one, figures 2 and 3", **layout
     )
@@ -115,6 +110,9 @@ def _estimate(options: argparse.Namespace) -> int:
         need(package, extra="cli", purpose="the command line")
     need("matplotlib", extra="plot", purpose="drawing the picture")
     path, config = _configuration(options.config)
+    wanted = config.table
+    if wanted is None:
+        raise UserError(f"{path.name}: table is missing; estimate needs measurements")
 
     from .output import check_writable, write_all, write_csv, write_netcdf
     from .problem import build_problem, importable, resolve
@@ -133,7 +131,6 @@ def _estimate(options: argparse.Namespace) -> int:
     _use_float64()
     title = config.title or path.stem
     with importable(path.parent), DelayedProgress(options.progress) as progress:
-        wanted = config.table
         transform = wanted.transform and resolve(wanted.transform, f"{path.name}: table.transform")
         draw = resolve(names.draw, f"{path.name}: outputs.draw") if names.draw else _draw
         problem = build_problem(config, path.name)
@@ -176,6 +173,22 @@ def _design(options: argparse.Namespace) -> int:
             print(f"  {kind} {index + 1} is {name}{f' [{unit}]' if unit else ''}")
     print(certificate)
     return 0
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    path, config = _configuration(options.config)
+    from .study import sweep
+
+    _use_float64()
+    return sweep(options, path, config)
+
+
+def _monte_carlo(options: argparse.Namespace) -> int:
+    path, config = _configuration(options.config)
+    from .study import monte_carlo
+
+    _use_float64()
+    return monte_carlo(options, path, config)
 
 
 def _reproduce(options: argparse.Namespace) -> int:

@@ -4,74 +4,32 @@ from __future__ import annotations
 
 import difflib
 import math
-import re
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
-from .._extras import need
+from pydantic import BaseModel, Field, ValidationError, model_validator
+
 from .errors import UserError, reason
-
-pydantic = need("pydantic", extra="cli", purpose="the command line")
-
-from pydantic import (  # noqa: E402  (after the check above, so that a missing package gives one line)
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    model_validator,
-)
+from .fields import Bounds, FileName, Number, Part, Reference, SignalName, check_box
+from .study_config import MonteCarloPart, SweepPart
 
 
-def _not_nan(value: float) -> float:
-    if math.isnan(value):
-        raise ValueError("must be a number, not nan; use -inf or inf for an unknown bound")
-    return value
-
-
-def _reference(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", value):
-        raise ValueError(f'must read "module:attribute", got "{value}"')
-    return value
-
-
-def _signal_name(value: str) -> str:
-    if not re.fullmatch(r"[^\W\d][\w .+-]*(?<! )", value):
-        raise ValueError(f'must start with a letter and use letters, digits and _ . + - only, got "{value}"')
-    return value
-
-
-def _file_name(value: str) -> str:
-    if Path(value).name != value or value in ("", ".", ".."):
-        raise ValueError(f'must be a plain file name inside the --out folder, got "{value}"')
-    return value
-
-
-Number = Annotated[float, AfterValidator(_not_nan)]
-Reference = Annotated[str, AfterValidator(_reference)]
-FileName = Annotated[str, AfterValidator(_file_name)]
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class SystemPart(_Part):
+class SystemPart(Part):
     """Where the System comes from."""
 
     use: Reference
-    arguments: dict[str, Any] = {}
+    arguments: dict[str, Any] = Field(default_factory=dict)
 
 
-class Signal(_Part):
+class Signal(Part):
     """Name and unit of one component."""
 
-    name: Annotated[str, AfterValidator(_signal_name)]
+    name: SignalName
     unit: str = ""
 
 
-class SignalsPart(_Part):
+class SignalsPart(Part):
     """Names in the order of the components; a list left out is filled with x1, x2, ... ."""
 
     state: list[Signal] | None = None
@@ -80,25 +38,7 @@ class SignalsPart(_Part):
     known_input: list[Signal] | None = None
 
 
-class Bounds(_Part):
-    """A box: either ``radius`` (symmetric) or ``lower`` and ``upper``."""
-
-    radius: list[Number] | None = None
-    lower: list[Number] | None = None
-    upper: list[Number] | None = None
-
-    @model_validator(mode="after")
-    def _check(self) -> Bounds:
-        if self.radius is None:
-            _check_box(self.lower, self.upper, "needs radius, or both lower and upper")
-        elif self.lower is not None or self.upper is not None:
-            raise ValueError("give either radius or lower and upper, not both")
-        elif min(self.radius, default=0.0) < 0:
-            raise ValueError(f"radius has the negative value {min(self.radius):g}")
-        return self
-
-
-class RegionPart(_Part):
+class RegionPart(Part):
     """The box the gain is designed for, or ``auto = true``."""
 
     auto: bool = False
@@ -108,30 +48,20 @@ class RegionPart(_Part):
     @model_validator(mode="after")
     def _check(self) -> RegionPart:
         if not self.auto:
-            _check_box(self.lower, self.upper, "needs both lower and upper, or auto = true")
+            check_box(self.lower, self.upper, "needs both lower and upper, or auto = true")
         elif self.lower is not None or self.upper is not None:
             raise ValueError("give either auto = true or lower and upper, not both")
         return self
 
 
-def _check_box(lower: list[float] | None, upper: list[float] | None, needs: str) -> None:
-    if lower is None or upper is None:
-        raise ValueError(needs)
-    if len(lower) != len(upper):
-        raise ValueError(f"lower has {len(lower)} values, upper has {len(upper)}")
-    for index, (low, high) in enumerate(zip(lower, upper, strict=True)):
-        if low > high or low == math.inf or high == -math.inf:
-            raise ValueError(f"bounds cross at index {index}: lower = {low:g}, upper = {high:g}")
-
-
-class NoisePart(_Part):
+class NoisePart(Part):
     """Bounds of the process noise w and of the measurement noise v."""
 
     w: Bounds
     v: Bounds
 
 
-class DesignPart(_Part):
+class DesignPart(Part):
     """Options of ``design_observer``; what is left out keeps the library's default."""
 
     gains: Annotated[int, Field(ge=1)] | None = None
@@ -143,25 +73,25 @@ class DesignPart(_Part):
     allow_uncertified: bool | None = None
 
 
-class TablePart(_Part):
+class TablePart(Part):
     """The logged measurements."""
 
     file: str
     time: str
     sample_time: Annotated[Number, Field(gt=0, lt=math.inf)]
     y: Annotated[list[str], Field(min_length=1)]
-    u: list[str] = []
-    missing: list[float | int | str] = []
+    u: list[str] = Field(default_factory=list)
+    missing: list[float | int | str] = Field(default_factory=list)
     transform: Reference | None = None
 
 
-class EstimatePart(_Part):
+class EstimatePart(Part):
     """Options of ``estimate``."""
 
     on_conflict: Literal["restart", "hold"] = "restart"
 
 
-class OutputsPart(_Part):
+class OutputsPart(Part):
     """File names inside the ``--out`` folder; by default named after the configuration file."""
 
     netcdf: FileName | None = None
@@ -170,7 +100,7 @@ class OutputsPart(_Part):
     draw: Reference | None = None
 
 
-class Config(_Part):
+class Config(Part):
     """The whole file."""
 
     title: str = ""
@@ -181,9 +111,11 @@ class Config(_Part):
     u_region: Bounds | None = None
     initial: Bounds
     design: DesignPart = DesignPart()
-    table: TablePart
+    table: TablePart | None = None
     estimate: EstimatePart = EstimatePart()
     outputs: OutputsPart = OutputsPart()
+    sweep: SweepPart | None = None
+    monte_carlo: MonteCarloPart | None = None
 
 
 def read_config(path: Path) -> Config:
@@ -242,7 +174,7 @@ def _did_you_mean(location: tuple[int | str, ...]) -> str:
         if isinstance(part, str) and model is not None:
             field = model.model_fields.get(part)
             model = None if field is None else _model_in(field.annotation)
-    known = [] if model is None else list(model.model_fields)
+    known = [] if model is None else [field.alias or name for name, field in model.model_fields.items()]
     close = difflib.get_close_matches(str(location[-1]), known, n=1)
     if close:
         return f"; did you mean {close[0]}?"

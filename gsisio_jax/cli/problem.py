@@ -12,8 +12,9 @@ from typing import Any
 
 from ..interval import Interval
 from ..system import Noise, System
-from .config import Bounds, Config, Signal
+from .config import Config, Signal
 from .errors import UserError, reason
+from .fields import Bounds
 
 
 @dataclass(frozen=True)
@@ -104,8 +105,9 @@ def build_problem(config: Config, file: str) -> Problem:
         check(f"signals.{key}", signals, what, "name")
         return Names(tuple(signal.name for signal in signals), tuple(signal.unit for signal in signals))
 
-    check("table.y", config.table.y, "outputs", "column")
-    check("table.u", config.table.u, "known inputs", "column")
+    if config.table is not None:
+        check("table.y", config.table.y, "outputs", "column")
+        check("table.u", config.table.u, "known inputs", "column")
     if config.u_region is not None and system.m == 0:
         raise UserError(f"{file}: u_region is given, the system has no known inputs")
     if config.region.auto:

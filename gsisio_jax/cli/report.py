@@ -108,21 +108,22 @@ def _signals(problem: Problem, certificate: Any, dataset: Any) -> list[Row]:
             width = dataset[f"{name}_upper"].values - dataset[f"{name}_lower"].values
             width = width[~np.isnan(width)]
             finite = width[np.isfinite(width)]
-            promised = _short(steady[index]) if certificate.certified else "none"
+            promised = short(steady[index]) if certificate.certified else "none"
             rows.append(
                 (
                     f"{name} [{unit}]" if unit else name,
-                    _short(finite.mean()) if len(finite) else "unbounded",
-                    "" if len(width) == 0 else "unbounded" if np.isinf(width[-1]) else _short(width[-1]),
+                    short(finite.mean()) if len(finite) else "unbounded",
+                    "" if len(width) == 0 else "unbounded" if np.isinf(width[-1]) else short(width[-1]),
                     str(len(width) - len(finite)),
                     promised,
-                    _short(slack[index]) if slack is not None and certificate.certified else "",
+                    short(slack[index]) if slack is not None and certificate.certified else "",
                 )
             )
     return rows
 
 
-def _short(value: float) -> str:
+def short(value: float) -> str:
+    """A width in few digits."""
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
 
 

@@ -34,7 +34,7 @@ from gsisio_jax import rounding
 from gsisio_jax.inclusion.elementary import LIMIT
 from gsisio_jax.inclusion.node import Node, best_form, guard, product, scaled_slack, slope_reach, times
 from gsisio_jax.inclusion.waves import Wave, crosses
-from gsisio_jax.interval import Interval, choose, entire_like
+from gsisio_jax.interval import Interval, choose, entire_like, larger, smaller
 
 INF = math.inf
 # Below this relative width a secant is mostly rounding; the tangent at the middle is as good there.
@@ -69,7 +69,7 @@ def extremes(values: list[Any]) -> Interval:
     """Smallest and largest of several arrays."""
     lower = upper = values[0]
     for value in values[1:]:
-        lower, upper = jnp.minimum(lower, value), jnp.maximum(upper, value)
+        lower, upper = smaller(lower, value), larger(upper, value)
     return Interval.unchecked(lower, upper)
 
 

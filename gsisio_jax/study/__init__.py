@@ -1,15 +1,20 @@
 """Studies: many runs of an observer over named axes, reduced as they go along.
 
-`sweep` runs records at hand.
+`sweep` runs records at hand, `monte_carlo` simulates its own.
 """
 
 from gsisio_jax.study.axes import Axis, Layout, Truth, grid
+from gsisio_jax.study.containment import BROKEN
+from gsisio_jax.study.monte_carlo import monte_carlo
 from gsisio_jax.study.reduce import Context, Kept, Reduction, Variable
 from gsisio_jax.study.reductions import REDUCTIONS, quantiles, settle
+from gsisio_jax.study.summary import STATISTICS, summary
 from gsisio_jax.study.sweep import sweep
 
 __all__ = [
+    "BROKEN",
     "REDUCTIONS",
+    "STATISTICS",
     "Axis",
     "Context",
     "Kept",
@@ -18,7 +23,9 @@ __all__ = [
     "Truth",
     "Variable",
     "grid",
+    "monte_carlo",
     "quantiles",
     "settle",
+    "summary",
     "sweep",
 ]

@@ -16,6 +16,7 @@ import gsisio_jax as gx
 from gsisio_jax.study import Context, Kept, Reduction, Variable, quantiles, settle
 from gsisio_jax.study.kernel import fingerprint, tile_size
 from gsisio_jax.study.reductions import _quantiles, resolve
+from gsisio_jax.study.rows import Recorded
 
 T = 14
 RECORDS, BOXES = 4, 2
@@ -336,7 +337,7 @@ def test_a_store_holds_the_same_study_and_resumes(plain, in_tiles_of_four, tmp_p
     stored = gx.sweep(**plain, batch=4, store=tmp_path / "study.zarr")
     for name in in_tiles_of_four.data_vars:
         np.testing.assert_array_equal(stored[name], in_tiles_of_four[name])
-    module = importlib.import_module("gsisio_jax.study.sweep")
+    module = importlib.import_module("gsisio_jax.study.job")
     monkeypatch.setattr(module, "run_cases", lambda *_: pytest.fail("computed again"))
     again = gx.sweep(**plain, batch=4, store=tmp_path / "study.zarr")
     np.testing.assert_array_equal(again.state_width_max, in_tiles_of_four.state_width_max)
@@ -349,7 +350,7 @@ def test_the_fingerprint_tells_studies_apart_and_knows_a_study_again(study):
     twin = replace(study.observer, system=replace_maps(study.observer.system))
 
     def of(observer=study.observer, reduce=SETTLED, **change):
-        return fingerprint(observer, arguments | change, reduce, 7)
+        return fingerprint(observer, arguments | change, Recorded(), reduce, 7)
 
     assert of() == of(twin)
     moved = gx.grid("box", gx.Interval(study.initial.lower, np.nextafter(study.initial.upper, 9)))
@@ -373,7 +374,7 @@ class Terminal(io.StringIO):
 
 
 def test_a_bar_appears_on_a_terminal_only(plain, in_tiles_of_four, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("gsisio_jax.study.sweep"), "PATIENCE", 0.0)
+    monkeypatch.setattr(importlib.import_module("gsisio_jax.study.job"), "PATIENCE", 0.0)
     shown = []
     for stream in (Terminal(), io.StringIO()):
         with monkeypatch.context() as patch:

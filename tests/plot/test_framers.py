@@ -12,20 +12,11 @@ import pytest
 from gsisio_jax import dataset, plot
 from gsisio_jax.alarms import Alarm
 from gsisio_jax.interval import Interval
+from gsisio_jax.plot.boxes import thinned
+from gsisio_jax.plot.style import MAXIMUM_POINTS
 from gsisio_jax.status import Status
 
 STEPS = 30
-
-
-@pytest.fixture(autouse=True)
-def no_window():
-    import matplotlib
-
-    matplotlib.use("Agg")
-    yield
-    from matplotlib import pyplot
-
-    pyplot.close("all")
 
 
 @pytest.fixture
@@ -141,8 +132,8 @@ def test_thinning_keeps_every_box_inside():
     time = np.arange(50_001.0)
     lower = rng.normal(size=time.size)
     upper = lower + rng.random(time.size)
-    at, bottom, top = plot._thinned(time, lower, upper)
-    assert len(at) <= plot.MAXIMUM_POINTS
+    at, bottom, top = thinned(time, lower, upper)
+    assert len(at) <= MAXIMUM_POINTS
     group = np.searchsorted(at, time, side="right") - 1
     assert (bottom[group] <= lower).all()
     assert (upper <= top[group]).all()
@@ -188,14 +179,15 @@ def test_a_missing_package_is_one_line():
     code = (
         "import sys; sys.modules['matplotlib'] = None; sys.modules['xarray'] = None\n"
         "from gsisio_jax import dataset, plot\n"
-        "for call, arguments in ((plot.framers, [None]), (plot.save, [None, 'x.png']), (dataset.to_dataset, [None])):\n"
+        "drawn = [(getattr(plot, name), [None]) for name in ('framers', 'widths', 'heatmap', 'curves', 'funnel')]\n"
+        "for call, arguments in (*drawn, (plot.save, [None, 'x.png']), (dataset.to_dataset, [None])):\n"
         "    try: call(*arguments)\n"
         "    except ImportError as error: print(error)\n"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     line = "drawing a picture needs matplotlib; install it with: pip install 'gsisio_jax[plot]'"
     other = "a labelled dataset needs xarray; install it with: pip install 'gsisio_jax[cli]'"
-    assert out.splitlines() == [line, line, other]
+    assert out.splitlines() == [line] * 6 + [other]
 
 
 def test_importing_the_library_loads_no_optional_package():

@@ -1,0 +1,79 @@
+"""What ``--help`` says below the options."""
+
+from __future__ import annotations
+
+EXAMPLES = """\
+examples:
+  gsisio estimate flight                     a built-in example; files go to results/flight
+  gsisio estimate pump.toml --out today      your own system and table
+  gsisio design pump.toml                    what the observer promises, without any data
+  gsisio sweep paper                         widths over noise bounds and initial boxes
+  gsisio monte-carlo paper                   a thousand simulated runs, each box checked against the truth
+  gsisio reproduce                           the paper's example; files go to results/paper
+
+CONFIG is a TOML file. It names the system ("module:attribute", also a module beside the file), the
+noise bounds, the region, the initial box, the table of measurements (CSV or Parquet) and the outputs.
+The built-in examples are commented and meant to be copied.
+
+estimate writes three files: a labelled NetCDF, a CSV with the columns
+time,<signal>_lower,<signal>_upper,...,status  and a PNG. status is a sum of
+1 conflict (a certified alarm), 2 missing data, 4 unbounded, 8 outside the region, 16 crossed.
+
+exit codes: 0 done, 1 a simulated run was not held by its boxes (monte-carlo), 2 something in the
+command, the configuration, the table or the folder is wrong (one line says what, and no file is
+written), 130 interrupted (143: by SIGTERM).
+"""
+
+_STUDIES = """\
+A study is stored tile by tile in DIR/NAME_{kind}.zarr. Stop it with Ctrl-C, or let it be killed: the
+same command goes on where it was, and ends in the same numbers. Beside the store it writes
+NAME_{kind}.nc (all numbers, labelled), NAME_{kind}_curves.png (widths beside the certificate) where
+something varies, NAME_{kind}_heatmap.png where two things do, and a summary on standard output.
+"""
+
+SWEEP = (
+    _STUDIES.format(kind="sweep")
+    + """
+The table [sweep] of CONFIG says what varies; all of it is combined in all ways:
+
+  [sweep]
+  reduce = ["final", "max", "mean"]  # what is kept of each case; also rms, settle, first_conflict, status,
+                                     # boxes (everything), {quantiles = [0.5, 0.95]}, {settle = 3}
+  records = "logs/*.csv"             # left out: the file of [table]; a pattern or a list: axis "record"
+  batch = 65536                      # cases per tile; left out: chosen by memory
+  picture = "mean"                   # which of the widths is drawn; left out: the last ones
+
+  [sweep.axes.noise]                 # multiples of the stated noise bounds; of = "w", "v" or "both"
+  from = 0.1
+  to = 10
+  count = 20
+  spacing = "log"                    # or "linear"
+
+  [sweep.axes.initial]               # multiples of the initial box, about its centre
+  scale = [0.5, 1, 2]
+
+gsisio sweep paper --out DIR  runs a small one.
+"""
+)
+
+MONTE_CARLO = (
+    _STUDIES.format(kind="monte_carlo")
+    + """
+The table [monte_carlo] of CONFIG says what is simulated; no [table] is needed:
+
+  [monte_carlo]
+  runs = 1000                        # or their numbers, such as [17]
+  steps = 200
+  seed = 0
+  draw = "vertices"                  # noise on the vertices of its bounds; "uniform"; "module:attribute"
+  x0 = {lower = [0, 0], upper = [1, 1]}  # of the true states; left out: the initial box
+  d = {amplitude = [2.0]}            # unknown input, uniform in +-amplitude, or "module:attribute",
+                                     # a function d(key, k, x) in jax.numpy; left out: zero
+  u = [0.1]                          # known inputs, constant, or "module:attribute"
+  reduce, batch, picture and [monte_carlo.axes...] as in gsisio sweep --help
+
+A box that misses the truth ends the command with exit code 1 and the seed, run and step of it.
+
+gsisio monte-carlo paper --out DIR  runs a small one.
+"""
+)

@@ -1,0 +1,16 @@
+"""Pictures: boxes over time, their widths, heat maps and curves of studies, labelled without being asked.
+
+`framers` draws boxes over time, `widths` their widths beside what the certificate promises, `funnel` many boxes closing
+in. `heatmap` and `curves` draw what a study kept over the axes that it varied. `save` writes `framers` into a file.
+matplotlib is imported when a picture is drawn, never before.
+"""
+
+from __future__ import annotations
+
+from gsisio_jax.plot.boxes import framers, save
+from gsisio_jax.plot.closing import funnel
+from gsisio_jax.plot.lines import curves
+from gsisio_jax.plot.mesh import heatmap
+from gsisio_jax.plot.narrowing import widths
+
+__all__ = ["curves", "framers", "funnel", "heatmap", "save", "widths"]

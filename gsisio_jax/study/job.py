@@ -1,0 +1,266 @@
+"""A study as tiles that any process can compute, and the run that collects them."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+import gsisio_jax
+from gsisio_jax._extras import need
+from gsisio_jax.estimation import AnyObserver
+from gsisio_jax.study import cluster
+from gsisio_jax.study import mesh as devices
+from gsisio_jax.study.axes import Layout
+from gsisio_jax.study.kernel import fingerprint, outline, run_cases, tile_size
+from gsisio_jax.study.labels import Labels, coordinates_of, variables_of
+from gsisio_jax.study.promises import along, beside, promised
+from gsisio_jax.study.reduce import Reduction
+from gsisio_jax.study.rows import Rows
+
+PATIENCE = 2.0  # seconds before a bar appears
+
+Results = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """All that a tile of a study takes; can be sent to other processes.
+
+    Attributes:
+        call: what messages name.
+        observer: in the type of the data.
+        arguments: of all cases, bare or on an axis.
+        layout: the axes.
+        rows: what the observer is given at every step.
+        reductions: what is kept of every run.
+        hold: as in `estimate`, ``on_conflict="hold"``.
+        size: cases per tile.
+        shapes: of the results of one case.
+        cost: bytes of working set of a case, where the size of a tile was chosen by it.
+        mesh: devices that share a tile, from `mesh.flat`.
+    """
+
+    call: str
+    observer: AnyObserver
+    arguments: dict[str, Any]
+    layout: Layout
+    rows: Rows
+    reductions: tuple[Reduction, ...]
+    hold: bool
+    size: int
+    shapes: dict[str, jax.ShapeDtypeStruct]
+    cost: float | None = None
+    mesh: Mesh | None = None
+
+    @classmethod
+    def plan(
+        cls,
+        call: str,
+        observer: AnyObserver,
+        arguments: dict[str, Any],
+        dtype: Any,
+        ranks: dict[str, tuple[int, ...]] | None,
+        rows: Rows,
+        reductions: tuple[Reduction, ...],
+        hold: bool,
+        batch: int | None,
+    ) -> Job:
+        """Lay out the cases and choose the size of a tile.
+
+        Raises:
+            ValueError: the axes do not agree, or `batch` is not a number of cases.
+        """
+        noise = arguments["noise"]
+        steady = along(noise, promised(observer.certificate, noise)[0].astype(dtype))
+        # In the order of the arguments, so that the axes are those that the user sees.
+        layout = Layout.build(call, arguments | {"steady": steady}, ranks)
+        arguments = arguments | {"steady": steady}
+        if dtype != np.float64:
+            observer = observer.astype(dtype)
+        one, shared = layout.take(arguments, np.zeros(1, int)), layout.shared(arguments)
+        shapes, cost = outline(observer, one, shared, rows, reductions, hold)
+        size, chosen = _batch(call, batch, cost, layout.cases), cost if batch is None else None
+        return cls(call, observer, arguments, layout, rows, reductions, hold, size, shapes, chosen)
+
+    def on(self, mesh: Any) -> Job:
+        """The same study with every tile spread over devices; a chosen tile grows with their number.
+
+        Raises:
+            ValueError: not a mesh of local devices.
+        """
+        mesh = devices.flat(self.call, mesh)
+        size = self.size if self.cost is None else tile_size(self.cost / mesh.size, self.layout.cases)
+        return replace(self, size=size, mesh=mesh)
+
+    @cached_property
+    def _fixed(self) -> tuple[AnyObserver, Any]:
+        """What all tiles share, on the devices."""
+        shared = self.layout.shared(self.arguments)
+        if self.mesh is None:
+            return self.observer, jax.device_put(shared)
+        return devices.copied(self.observer, self.mesh), devices.copied(shared, self.mesh)
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles."""
+        return -(-self.layout.cases // self.size)
+
+    def cases(self, tile: int) -> np.ndarray:
+        """Numbers of the cases of a tile."""
+        return np.arange(tile * self.size, min((tile + 1) * self.size, self.layout.cases))
+
+    def start(self, tile: int) -> dict[str, Any]:
+        """Results of a tile, started but not waited for; the last one is filled up with its last case."""
+        count = self.size if self.mesh is None else devices.padded(self.size, self.mesh)
+        cases = np.minimum(tile * self.size + np.arange(count), self.layout.cases - 1)
+        varying = self.layout.take(self.arguments, cases)
+        if self.mesh is not None:
+            varying = devices.spread(varying, self.mesh)
+        observer, shared = self._fixed
+        return run_cases(observer, varying, shared, self.rows, self.reductions, self.hold)
+
+    def finish(self, tile: int, running: dict[str, Any]) -> Results:
+        """Wait for a tile that was started, and check it.
+
+        Raises:
+            ValueError: the results cannot be (see `Rows.check`).
+        """
+        cases = self.cases(tile)
+        results = {name: np.asarray(array)[: len(cases)] for name, array in running.items()}
+        self.rows.check(self, cases, results)
+        return results
+
+    def fingerprint(self) -> str:
+        """Identifies the study by all that its numbers depend on."""
+        axes = dict(zip(self.layout.names, self.layout.sizes, strict=True))
+        rest = [axes, self.layout.placed, self.size, self.hold]
+        if self.mesh is not None and self.mesh.size > 1:
+            rest.append(f"{self.mesh.size} devices")  # each runs a smaller tile, which may round in other places
+        return fingerprint(self.observer, self.arguments, self.rows, self.reductions, *rest)
+
+
+def run(
+    job: Job,
+    observer: AnyObserver,
+    labels: Labels,
+    title: str,
+    store: Any,
+    resume: bool,
+    progress: bool,
+    client: Any = None,
+    mesh: Any = None,
+) -> Any:
+    """All tiles of a study, as the labelled dataset.
+
+    Args:
+        job: the study.
+        observer: as the user gave it (that of the job may be in single precision).
+        labels: names and units.
+        title: attribute of the dataset.
+        store: path, or None for memory.
+        resume: go on with a store that is there.
+        progress: show a bar.
+        client: of a Dask cluster that computes the tiles, or None for this process.
+        mesh: local devices that share every tile, or None.
+
+    Raises:
+        ValueError: `client` and `mesh` together, or one of them cannot be used; or a tile fails.
+    """
+    xarray = need("xarray", extra="study", purpose="a study")
+    if client is not None and mesh is not None:
+        raise ValueError(
+            f"{job.call}: `client` and `mesh` cannot be combined; give `client` for several machines (each worker uses "
+            "the first device that it sees), or `mesh` for several devices of this one"
+        )
+    if client is not None:
+        cluster.check(job.call, client)
+    if mesh is not None:
+        job = job.on(mesh)
+    layout = job.layout
+    variables = variables_of((*job.reductions, job.rows), job.shapes, labels)
+    coordinates = coordinates_of(layout, job.reductions, labels, variables)
+    attributes = {
+        "title": title,
+        "certificate": str(observer.certificate),
+        "steps": labels.steps,
+        "tile": job.size,
+        "library": f"gsisio_jax {gsisio_jax.__version__}, jax {jax.__version__}",
+    }
+    if store is None:
+        values = {name: np.empty((layout.cases, *v[0]), v[1]) for name, v in variables.items()}
+
+        def keep(tile: int, results: Results) -> None:
+            for name, array in results.items():
+                values[name][job.cases(tile)[0] : job.cases(tile)[-1] + 1] = array
+
+        with _bar(job, range(job.tiles), progress) as advance:
+            if client is None:
+                _compute(job, range(job.tiles), keep, advance)
+            else:
+                cluster.compute(client, job, range(job.tiles), advance, keep=keep)
+        data = {
+            name: ((*layout.names, *dims), values[name].reshape((*layout.sizes, *shape)), about)
+            for name, (shape, _, dims, about) in variables.items()
+        }
+        result = xarray.Dataset(data, coords=coordinates, attrs=attributes)
+    else:
+        from gsisio_jax.study.store import Header, TileStore
+
+        axes = dict(zip(layout.names, layout.sizes, strict=True))
+        header = Header(layout.cases, job.size, variables, coordinates, attributes, job.fingerprint(), axes)
+        tiles = TileStore.open(store, header, resume)
+        missing = tiles.missing()
+        with _bar(job, missing, progress) as advance:
+            if client is None:
+                _compute(job, missing, tiles.write, advance)
+            else:
+                cluster.compute(client, job, missing, advance, store=tiles)
+        result = tiles.dataset()
+    return result.assign(beside(observer, layout, promised(observer.certificate, job.arguments["noise"]), labels))
+
+
+@contextlib.contextmanager
+def _bar(job: Job, tiles: Sequence[int], progress: bool) -> Iterator[Callable[[int], None]]:
+    """What is to be called after every tile; moves a bar where there is a terminal."""
+    if not (progress and tiles and sys.stderr.isatty()):
+        yield lambda tile: None
+        return
+    tqdm = need("tqdm", extra="study", purpose="a progress bar (progress=False does without)")
+    with tqdm.tqdm(total=job.layout.cases, unit="case", unit_scale=True, delay=PATIENCE, leave=False) as bar:
+        bar.update(job.layout.cases - sum(len(job.cases(tile)) for tile in tiles))
+        yield lambda tile: bar.update(len(job.cases(tile)))
+
+
+def _compute(
+    job: Job, tiles: Sequence[int], keep: Callable[[int, Results], None], advance: Callable[[int], None]
+) -> None:
+    """Tiles in order, two at a time: one is started before the last one is waited for, so that no core stands idle."""
+
+    def finish(tile: int, running: dict[str, Any]) -> None:
+        keep(tile, job.finish(tile, running))
+        advance(tile)
+
+    before: tuple[int, dict[str, Any]] | None = None
+    for tile in tiles:
+        running = job.start(tile)
+        if before is not None:
+            finish(*before)
+        before = tile, running
+    if before is not None:
+        finish(*before)
+
+
+def _batch(call: str, batch: int | None, cost: float, cases: int) -> int:
+    if batch is None:
+        return tile_size(cost, cases)
+    if not isinstance(batch, int | np.integer) or batch < 1:
+        raise ValueError(f"{call}: `batch` must be a number of cases per tile, at least 1, or None; got {batch!r}")
+    return min(int(batch), cases)
