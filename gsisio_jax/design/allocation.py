@@ -160,6 +160,8 @@ class _Market:
         slopes = slopes_on(system, feedthrough.T2, region, u_region)
         if not slopes.finite:
             raise NoDesignFound(f"allocate: the derivatives of f or g are not bounded on the region {region}")
+        # Where slopes vary, the certificate also asks that the boxes fit into the region.
+        self.limit = required if slopes.affine else np.minimum(required, np.asarray(region.width))
         self.problem = Plan(system, noise, feedthrough, u_region).problem(slopes)
         check_rank(self.problem)
 
@@ -216,10 +218,10 @@ class _Market:
         first = self.linear(low)
         if first is None:
             raise NoDesignFound("allocate: no gain contracts on this region, whatever the noise")
-        limit = self.required * (1 - _MARGIN)
+        limit = self.limit * (1 - _MARGIN)
         if not (first[0] @ low + first[1] <= limit).all():
             raise ValueError(
-                f"allocate: the required widths {self.required} cannot be certified: even {self.limits[0]:g} times the "
+                f"allocate: the required widths {self.limit} (at most those of the region, where the certificate has one) cannot be certified: even {self.limits[0]:g} times the "
                 f"bounds for sale give {first[0] @ low + first[1]}. Improve the other bounds too, or ask for less."
             )
         best: tuple[float, np.ndarray, list[float]] | None = None
