@@ -26,7 +26,7 @@ class FirstSweep(eqx.Module):
         form: affine bounds of T2 g there, or None where g takes u.
         inverses: ``(I - |N_z| R)^{-1}`` there, for the gains named in `gains`.
         gains: indices of the gains for which ``|N_z| R`` contracts there.
-        affine_output: T2 g is affine on the state bounds, so psi is zero.
+        affine_output: T2 g is linear on the state bounds, without a constant, so psi is zero.
 
     Source: design 4.3, step 3.
     """

@@ -139,7 +139,7 @@ def design_observer(
         form=None if system.g_takes_u else first,
         inverses=np.array([inverse for inverse in contracting if inverse is not None]).reshape(-1, system.n, system.n),
         gains=tuple(k for k, inverse in enumerate(contracting) if inverse is not None),
-        affine_output=not everywhere.Z_radius.any(),
+        affine_output=not everywhere.Z_radius.any() and not np.any([first.offset.lower, first.offset.upper]),
     )
     inputs = input_bounds(problem, width)
     observer = assemble(plan, problem, box, bank, start, inputs, everywhere.affine, methods, sweeps)
