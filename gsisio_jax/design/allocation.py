@@ -221,9 +221,9 @@ class _Market:
         limit = self.limit * (1 - _MARGIN)
         if not (first[0] @ low + first[1] <= limit).all():
             raise ValueError(
-                f"allocate: the required widths {self.limit} (at most those of the region, where the certificate has one) "
-                f"cannot be certified: even {self.limits[0]:g} times the bounds for sale give {first[0] @ low + first[1]}. "
-                "Improve the other bounds too, or ask for less."
+                f"allocate: the required widths {self.limit} (at most those of the region, where the certificate has "
+                f"one) cannot be certified: even {self.limits[0]:g} times the bounds for sale give "
+                f"{first[0] @ low + first[1]}. Improve the other bounds too, or ask for less."
             )
         best: tuple[float, np.ndarray, list[float]] | None = None
         for tilt in [np.ones(self.count), *(10.0 ** (s * row) for row in np.eye(self.count) for s in (-1, 1))]:
