@@ -16,6 +16,7 @@ import numpy as np
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.interval import Interval, add, image, intersect, scale
 from gsisio_jax.status import SOURCE_STRIDE, Source
+from gsisio_jax.ties import larger, largest, smaller, smallest
 
 _SMALLEST_SLOPE = 1e-9  # share of a strip's largest slope below which dividing by it can only widen
 _ROUNDING = 2.0**12  # gaps below this many ulps of the largest number of a step are not called contradictions
@@ -56,15 +57,17 @@ class Evidence(eqx.Module):
             by_row: the slack is that of each of the k boxes, not of each component.
         """
         box = self.box
-        slack = jnp.minimum(box.upper - others.lower, others.upper - box.lower)
-        lower = jnp.maximum(box.lower, others.lower.max(0))
-        upper = jnp.minimum(box.upper, others.upper.min(0))
+        slack = smaller(box.upper - others.lower, others.upper - box.lower)
+        lower = larger(box.lower, largest(others.lower, 0))
+        upper = smaller(box.upper, smallest(others.upper, 0))
         # The others may also miss each other where each of them meets the box.
         apart = jnp.where(upper < lower, upper - lower, jnp.inf)
-        tightest = jnp.minimum(slack.min(0), apart)
+        tightest = smaller(smallest(slack, 0), apart)
         empty = tightest < 0
         met = Interval.unchecked(jnp.where(empty, box.lower, lower), jnp.where(empty, box.upper, upper))
-        noted = self.weigh(slack.min(1), kind).weigh(apart, Source.STATE) if by_row else self.weigh(tightest, kind)
+        noted = (
+            self.weigh(smallest(slack, 1), kind).weigh(apart, Source.STATE) if by_row else self.weigh(tightest, kind)
+        )
         return Evidence(met, self.scale, noted.slacks, noted.sources)
 
     @property
@@ -81,7 +84,7 @@ class Evidence(eqx.Module):
         order = np.repeat(np.arange(len(self.slacks), dtype=np.int32), [len(c) for c in self.sources])
         first = jnp.where(slack < 0, order, len(self.slacks)).min()
         candidate = (order == first) | (first == len(self.slacks))
-        margin = jnp.where(candidate, slack, jnp.inf).min()
+        margin = smallest(jnp.where(candidate, slack, jnp.inf), 0)
         # No argmin and no gather: both are slow in batches.
         source = jnp.where(candidate & (slack == margin), codes, np.int32(np.iinfo(np.int32).max)).min()
         return margin, jnp.where(jnp.isinf(margin), 0, source)
@@ -175,7 +178,7 @@ def strips(evidence: Evidence, form: AffineForm, z: Interval) -> Evidence:
     if not slope.shape[0]:
         return evidence  # d reaches every output: none of them is free of it
     at_lower, at_upper = scale(slope, box.lower), scale(slope, box.upper)
-    low, high = jnp.minimum(at_lower, at_upper), jnp.maximum(at_lower, at_upper)  # (q, n)
+    low, high = smaller(at_lower, at_upper), larger(at_lower, at_upper)  # (q, n)
     reach = intersect(Interval.unchecked(low.sum(-1) + offset.lower, high.sum(-1) + offset.upper), form.range)[0]
     evidence = evidence.weigh(intersect(reach, z)[1], Source.OUTPUT)
     # Sums over the other states as masked sums: total minus own term would be inf - inf.
@@ -186,9 +189,7 @@ def strips(evidence: Evidence, form: AffineForm, z: Interval) -> Evidence:
     inverse = jnp.where(usable, 1 / jnp.where(usable, slope, 1), 0)
     a = scale(inverse, (z.lower - offset.upper)[:, None] - rest_high)
     b = scale(inverse, (z.upper - offset.lower)[:, None] - rest_low)
-    solved = Interval.unchecked(
-        jnp.where(usable, jnp.minimum(a, b), -jnp.inf), jnp.where(usable, jnp.maximum(a, b), jnp.inf)
-    )
+    solved = Interval.unchecked(jnp.where(usable, smaller(a, b), -jnp.inf), jnp.where(usable, larger(a, b), jnp.inf))
     return evidence.meet(solved, Source.OUTPUT, by_row=True)
 
 
@@ -259,16 +260,20 @@ def centred(right: Interval, N_z: Any, inverse: Any, remainder: Any, within: Int
     """
 
     def move(c: Any) -> Any:
-        return jnp.clip(middle - _vector(N_z, remainder(c)), within.lower, within.upper)
+        return _clip(middle - _vector(N_z, remainder(c)), within)
 
     middle = right.center
-    c = jnp.clip(middle, within.lower, within.upper)
+    c = _clip(middle, within)
     for _ in range(rounds):
         c = move(c)
     # The radius is taken from the centre that is really used, so that no side is lost where one is infinite.
-    radius = jnp.maximum(right.upper - middle, middle - right.lower)
+    radius = larger(right.upper - middle, middle - right.lower)
     reach = image(inverse, Interval.unchecked(-radius, radius + jnp.abs(c - move(c)))).upper
     return Interval.unchecked(c - reach, c + reach)
+
+
+def _clip(value: Any, box: Interval) -> Any:
+    return smaller(larger(value, box.lower), box.upper)
 
 
 def _vector(matrix: Any, vector: Any) -> Any:

@@ -21,6 +21,7 @@ import numpy as np
 from jax.core import Tracer
 
 from gsisio_jax.interval import Interval, choose
+from gsisio_jax.ties import larger, smaller
 
 
 @jax.custom_jvp
@@ -149,9 +150,7 @@ def product(a: Interval, b: Interval) -> Interval:
     """Product of two boxes."""
     p, q = times(a.lower, b.lower), times(a.lower, b.upper)
     r, s = times(a.upper, b.lower), times(a.upper, b.upper)
-    return Interval.unchecked(
-        jnp.minimum(jnp.minimum(p, q), jnp.minimum(r, s)), jnp.maximum(jnp.maximum(p, q), jnp.maximum(r, s))
-    )
+    return Interval.unchecked(smaller(smaller(p, q), smaller(r, s)), larger(larger(p, q), larger(r, s)))
 
 
 def slope_image(slope: Any, box: Interval) -> Interval:
@@ -175,7 +174,7 @@ def meet(node: Node) -> Node:
     if node.form is None:
         return node
     natural, image = node.range, node.form.image()
-    lower, upper = jnp.maximum(natural.lower, image.lower), jnp.minimum(natural.upper, image.upper)
+    lower, upper = larger(natural.lower, image.lower), smaller(natural.upper, image.upper)
     return Node(choose(lower <= upper, Interval.unchecked(lower, upper), natural), node.form, node.jac)
 
 

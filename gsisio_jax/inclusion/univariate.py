@@ -25,7 +25,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.node import Node, best_form, product, shift, stretch
-from gsisio_jax.interval import Interval, choose, entire_like, larger, smaller
+from gsisio_jax.interval import Interval, choose, entire_like
+from gsisio_jax.ties import larger, smaller
 
 INF = math.inf
 # Below this relative width a secant is mostly rounding; the tangent at the middle is as good there.
@@ -124,7 +125,7 @@ class Curve:
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
         low, high = self.phi.domain
-        a, b = jnp.maximum(a, low), jnp.minimum(b, high)
+        a, b = larger(a, low), smaller(b, high)
         finite = jnp.isfinite(a) & jnp.isfinite(b) & (a <= b)
         a, b = jnp.where(finite, a, self.phi.inner), jnp.where(finite, b, self.phi.inner)
         pa, pb = self.phi.at(a), self.phi.at(b)
@@ -177,9 +178,9 @@ class Wave:
         # With slope phi'(m) cos(r/2) the odd part of the rest, sin h - h cos(r/2), has its critical points at
         # +-r/2. It is then four times smaller than with the tangent, and no arccosine is needed.
         s = steepness * half_cos
-        odd = jnp.abs(steepness) * jnp.maximum(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
+        odd = jnp.abs(steepness) * larger(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
         even = value * (2 * half_cos**2 - 1)
-        rest = Interval.unchecked(jnp.minimum(value, even) - odd - s * m, jnp.maximum(value, even) + odd - s * m)
+        rest = Interval.unchecked(smaller(value, even) - odd - s * m, larger(value, even) + odd - s * m)
         return jnp.where(usable, s, 0), choose(usable, rest, natural)
 
 
