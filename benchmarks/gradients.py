@@ -67,7 +67,7 @@ def points(name: str, count: int) -> dict[str, Any]:
 
 
 def memory(steps: int, batch: int) -> dict[str, Any]:
-    """Memory of a gradient of mean widths by noise bounds, S1: of the compiled program (arguments, results and everything
+    """Memory of a gradient of mean widths by noise bounds, S1: of the compiled program (arguments, results and all
     between), and of the whole process, where XLA's compiler takes the most."""
     import jax
     import jax.numpy as jnp
@@ -113,11 +113,11 @@ def peak() -> float:
 def line(case: str, result: dict[str, Any]) -> str:
     state = "passed" if result["ok"] else "FAILED"
     if case == "memory":
+        sizes = [f"{result[f'{name}_mebibytes']:,.0f}" for name in ("program", "before", "compile", "peak")]
         return (
-            f"gradient over {result['steps']:,} steps, batch {result['batch']:,}: "
-            f"{result['program_mebibytes']:,.0f} MiB (process: {result['before_mebibytes']:,.0f} before, {result['compile_mebibytes']:,.0f} after compiling, "
-            f"{result['peak_mebibytes']:,.0f} in the end), {result['seconds']:.1f} s "
-            f"(compile {result['compile_seconds']:.1f} s)  {state}"
+            f"gradient over {result['steps']:,} steps, batch {result['batch']:,}: {sizes[0]} MiB (process: {sizes[1]} "
+            f"before, {sizes[2]} after compiling, {sizes[3]} in the end), {result['seconds']:.1f} s (compile "
+            f"{result['compile_seconds']:.1f} s)  {state}"
         )
     worst = ", ".join(f"{kind} {error:.1e}" for kind, error in result["worst"].items())
     return (

@@ -17,6 +17,7 @@ from gsisio_jax import rounding
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.interval import Interval, add, image, intersect, products, reach, scale, spread, widen
 from gsisio_jax.status import SOURCE_STRIDE, Source
+from gsisio_jax.ties import larger, largest, smaller, smallest
 
 _SMALLEST_SLOPE = 1e-9  # share of a strip's largest slope below which dividing by it can only widen
 _ROUNDING = 2.0**12  # gaps below this many ulps of the largest number of a step are not called contradictions
@@ -58,15 +59,17 @@ class Evidence(eqx.Module):
             by_row: the slack is that of each of the k boxes, not of each component.
         """
         box = self.box
-        slack = jnp.minimum(box.upper - others.lower, others.upper - box.lower)
-        lower = jnp.maximum(box.lower, others.lower.max(0))
-        upper = jnp.minimum(box.upper, others.upper.min(0))
+        slack = smaller(box.upper - others.lower, others.upper - box.lower)
+        lower = larger(box.lower, largest(others.lower, 0))
+        upper = smaller(box.upper, smallest(others.upper, 0))
         # The others may also miss each other where each of them meets the box.
         apart = jnp.where(upper < lower, upper - lower, jnp.inf)
-        tightest = jnp.minimum(slack.min(0), apart)
+        tightest = smaller(smallest(slack, 0), apart)
         empty = tightest < 0
         met = Interval.unchecked(jnp.where(empty, box.lower, lower), jnp.where(empty, box.upper, upper))
-        noted = self.weigh(slack.min(1), kind).weigh(apart, Source.STATE) if by_row else self.weigh(tightest, kind)
+        noted = (
+            self.weigh(smallest(slack, 1), kind).weigh(apart, Source.STATE) if by_row else self.weigh(tightest, kind)
+        )
         return Evidence(met, self.scale, noted.slacks, noted.sources)
 
     @property
@@ -83,7 +86,7 @@ class Evidence(eqx.Module):
         order = np.repeat(np.arange(len(self.slacks), dtype=np.int32), [len(c) for c in self.sources])
         first = jnp.where(slack < 0, order, len(self.slacks)).min()
         candidate = (order == first) | (first == len(self.slacks))
-        margin = jnp.where(candidate, slack, jnp.inf).min()
+        margin = smallest(jnp.where(candidate, slack, jnp.inf), 0)
         # No argmin and no gather: both are slow in batches.
         source = jnp.where(candidate & (slack == margin), codes, np.int32(np.iinfo(np.int32).max)).min()
         return margin, jnp.where(jnp.isinf(margin), 0, source)
@@ -214,8 +217,8 @@ def strips(evidence: Evidence, form: AffineForm, z: Interval) -> Evidence:
     inverse = jnp.where(usable, 1 / jnp.where(usable, slope, 1), 0)
     a, b = scale(inverse, own.lower), scale(inverse, own.upper)
     solved = Interval.unchecked(
-        jnp.where(usable, rounding.down(jnp.minimum(a, b), 4.0), -jnp.inf),
-        jnp.where(usable, rounding.up(jnp.maximum(a, b), 4.0), jnp.inf),
+        jnp.where(usable, rounding.down(smaller(a, b), 4.0), -jnp.inf),
+        jnp.where(usable, rounding.up(larger(a, b), 4.0), jnp.inf),
     )
     return evidence.meet(solved, Source.OUTPUT, by_row=True)
 
@@ -318,15 +321,15 @@ def centred(
     Source: design 4.3, steps 3 and 6.
     """
     middle = right.center
-    c = jnp.clip(middle, within.lower, within.upper)
+    c = _clip(middle, within)
     for _ in range(rounds):
         moved = (middle - _vector(N_z, remainder(c))).astype(middle.dtype)  # constants of g may have promoted it
-        c = jnp.clip(moved, within.lower, within.upper)
+        c = _clip(moved, within)
     moved = add(Interval.unchecked(middle, middle), image(-N_z, bounded_remainder(c)))
-    moved = Interval.unchecked(*(jnp.clip(side, within.lower, within.upper) for side in (moved.lower, moved.upper)))
-    move = rounding.up(jnp.maximum(abs(moved.upper - c), abs(c - moved.lower)))
+    moved = Interval.unchecked(*(_clip(side, within) for side in (moved.lower, moved.upper)))
+    move = rounding.up(larger(abs(moved.upper - c), abs(c - moved.lower)))
     # The radius is taken from the centre that is really used, so that no side is lost where one is infinite.
-    radius = rounding.up(jnp.maximum(right.upper - middle, middle - right.lower))
+    radius = rounding.up(larger(right.upper - middle, middle - right.lower))
     far = radius + move if slip is None else radius + move + spread(slip, abs(c))
     away = spread(inverse, rounding.up(far, 4.0))
     return Interval.unchecked(
@@ -337,6 +340,10 @@ def centred(
 
 def _sides(box: Interval) -> tuple[Any, Any]:
     return box.lower, box.upper
+
+
+def _clip(value: Any, box: Interval) -> Any:
+    return smaller(larger(value, box.lower), box.upper)
 
 
 def _vector(matrix: Any, vector: Any) -> Any:

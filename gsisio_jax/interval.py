@@ -18,6 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from gsisio_jax import rounding
+from gsisio_jax.ties import larger, smaller
 
 
 def is_concrete(value: Any) -> bool:
@@ -233,27 +234,6 @@ def _scale_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any
     return scale(factor, value), d_factor * finite + factor * d_value
 
 
-@jax.custom_jvp
-def smaller(a: Any, b: Any) -> Any:
-    """``jnp.minimum(a, b)`` whose derivative is that of one of the two, for certain.
-
-    JAX finds out which one it was by comparing the minimum with both for equality. Where XLA computes a number twice
-    and rounds it differently, neither is equal, and the derivative is lost.
-    """
-    return jnp.minimum(a, b)
-
-
-@smaller.defjvp
-def _smaller_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
-    (a, b), (da, db) = primals, tangents
-    return smaller(a, b), jnp.where(a <= b, da, db)
-
-
-def larger(a: Any, b: Any) -> Any:
-    """``jnp.maximum(a, b)`` with the derivative of `smaller`."""
-    return -smaller(-a, -b)
-
-
 def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
     """Bound the image of a box under a constant matrix (exact in real arithmetic).
 
@@ -341,7 +321,7 @@ def choose(mask: Any, a: Interval, b: Interval) -> Interval:
 
 def hull(a: Interval, b: Interval) -> Interval:
     """The smallest box that contains both boxes, elementwise."""
-    return Interval.unchecked(jnp.minimum(a.lower, b.lower), jnp.maximum(a.upper, b.upper))
+    return Interval.unchecked(smaller(a.lower, b.lower), larger(a.upper, b.upper))
 
 
 def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
@@ -356,7 +336,7 @@ def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
         before they miss each other. A negative slack is the size of the gap; there the first box is returned
         unchanged, so the result is never crossed: the caller must look at the slack.
     """
-    slack = jnp.minimum(a.upper - b.lower, b.upper - a.lower)
+    slack = smaller(a.upper - b.lower, b.upper - a.lower)
     empty = slack < 0
-    lower, upper = jnp.maximum(a.lower, b.lower), jnp.minimum(a.upper, b.upper)
+    lower, upper = larger(a.lower, b.lower), smaller(a.upper, b.upper)
     return Interval.unchecked(jnp.where(empty, a.lower, lower), jnp.where(empty, a.upper, upper)), slack

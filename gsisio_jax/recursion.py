@@ -19,6 +19,7 @@ from gsisio_jax.interval import Interval, add, choose, entire_like, image, inter
 from gsisio_jax.observer import Carry, Observer, StepOutput
 from gsisio_jax.status import Source, Status, bit_mask
 from gsisio_jax.system import Noise, System
+from gsisio_jax.ties import smaller
 
 
 @rounding.by_observer
@@ -287,7 +288,7 @@ def _exact_input(
     # Some d must reach the box at all: every combination of rows that is free of d contains 0.
     balance = add(image(exact.circuits, explained), image(exact.circuits_known, terms.known))
     balance = balance if missed is None else widen(balance, missed.of_inputs(observer.guard.circuits, box))
-    return met.box, evidence.weigh(jnp.minimum(balance.upper, -balance.lower), Source.BALANCE)
+    return met.box, evidence.weigh(smaller(balance.upper, -balance.lower), Source.BALANCE)
 
 
 def _finish(

@@ -17,11 +17,12 @@ import numpy as np
 
 from gsisio_jax._extras import need
 from gsisio_jax.design.assemble import Plan
-from gsisio_jax.design.bank import main_gain
+from gsisio_jax.design.bank import main_gain, units
 from gsisio_jax.design.build import design_observer
 from gsisio_jax.design.enclosures import slopes_on
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
+from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval import Interval
@@ -160,6 +161,8 @@ class _Market:
         slopes = slopes_on(system, feedthrough.T2, region, u_region)
         if not slopes.finite:
             raise NoDesignFound(f"allocate: the derivatives of f or g are not bounded on the region {region}")
+        # Where slopes vary, the certificate also asks that the boxes fit into the region.
+        self.limit = required if slopes.affine else np.minimum(required, np.asarray(region.width))
         self.problem = Plan(system, noise, feedthrough, u_region).problem(slopes)
         check_rank(self.problem)
 
@@ -211,26 +214,34 @@ class _Market:
             slope[:, j] = inverse @ alone.noise_width(N)
         return slope, constant - slope @ factors
 
+    def allowed(self, factors: np.ndarray) -> bool:
+        """Does the best gain keep the limit? One linear program, not polished."""
+        problem = self.at(factors)
+        N = optimal_gain(problem, np.ones(self.n), self.scale)
+        return N is not None and bool((problem.steady_width(N) <= self.limit).all())
+
     def search(self) -> tuple[np.ndarray, list[float]]:
         low = np.full(self.count, self.limits[0])
         first = self.linear(low)
         if first is None:
             raise NoDesignFound("allocate: no gain contracts on this region, whatever the noise")
-        limit = self.required * (1 - _MARGIN)
-        if not (first[0] @ low + first[1] <= limit).all():
+        least = first[0] @ low + first[1]
+        if not (least <= self.limit * (1 - _MARGIN)).all():
             raise ValueError(
-                f"allocate: the required widths {self.required} cannot be certified: even {self.limits[0]:g} times the "
-                f"bounds for sale give {first[0] @ low + first[1]}. Improve the other bounds too, or ask for less."
+                f"allocate: the required widths {self.limit} (at most those of the region, where the certificate has "
+                f"one) cannot be certified: even {self.limits[0]:g} times the bounds for sale give {least}. Improve "
+                "the other bounds too, or ask for less."
             )
+        self.scale = units(least)
         best: tuple[float, np.ndarray, list[float]] | None = None
-        for tilt in [np.ones(self.count), *(10.0 ** (s * row) for row in np.eye(self.count) for s in (-1, 1))]:
-            factors = self._ray(tilt, limit, first)
+        for tilt in self.tilts():
+            factors = self._ray(tilt)
             history = [self.cost(factors)]
             for _ in range(_ROUNDS):
                 model = self.linear(factors)
                 if model is None:
                     break
-                factors = self._buy(model, limit, factors)
+                factors = self._buy(model, self.limit * (1 - _MARGIN), factors)
                 history.append(self.cost(factors))
                 if history[-1] >= history[-2] * (1 - 1e-7):
                     break
@@ -239,22 +250,28 @@ class _Market:
         assert best is not None
         return best[1], best[2]
 
-    def _ray(self, tilt: np.ndarray, limit: np.ndarray, model: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """Factors in the proportions of `tilt` that are allowed, large ones."""
-        factors = np.full(self.count, self.limits[0])
-        for _ in range(3):
-            slope, constant = model
-            rate = slope @ tilt
-            share = np.min(np.where(rate > 0, (limit - constant) / np.where(rate > 0, rate, 1), np.inf))
-            candidate = np.clip(min(share, 1e12) * tilt, *self.limits)
-            if not (slope @ candidate + constant <= limit).all():
-                break
-            factors = candidate
-            again = self.linear(factors)
-            if again is None:
-                break
-            model = again
-        return factors
+    def tilts(self) -> list[np.ndarray]:
+        """Proportions of the factors to start from: every gain has its own cheapest bounds, so they are spread wide."""
+        rows = [np.zeros(self.count)]
+        if self.count > 1:
+            rows += [share * unit for unit in np.eye(self.count) for share in (-1.5, -0.5, 0.5, 1.5)]
+            if self.count > 2:
+                rows += list(np.random.default_rng(0).normal(size=(4 * self.count, self.count)))
+        return [10.0**row for row in rows]
+
+    def _ray(self, tilt: np.ndarray) -> np.ndarray:
+        """The largest allowed factors in the proportions of `tilt`, by bisection in the logarithm: widths only grow."""
+        low, high = np.log(self.limits[0] / tilt.max()), np.log(self.limits[1] / tilt.min())
+
+        def at(size: float) -> np.ndarray:
+            return np.clip(np.exp(size) * tilt, *self.limits)
+
+        if self.allowed(at(high)):
+            return at(high)
+        for _ in range(9):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self.allowed(at(middle)) else (low, middle)
+        return at(low)
 
     def _buy(self, model: tuple[np.ndarray, np.ndarray], limit: np.ndarray, start: np.ndarray) -> np.ndarray:
         """The cheapest factors for one gain, in their logarithms; never dearer than the start, never forbidden."""

@@ -147,11 +147,10 @@ def enclose(system: System, noise: Noise, region: Interval, u_region: Interval, 
 
 def _problem(system: System, T2: np.ndarray, data: Enclosed) -> GainProblem:
     state, known = (np.asarray(box.width) for box in (system.state_bounds, system.input_bounds))
+    F, F_radius, E, E_radius, C, R, dw, dv = (np.asarray(a, np.float64) for a in data)
     return GainProblem(
-        *(np.asarray(a, np.float64) for a in data[:4]), T2, *(np.asarray(a, np.float64) for a in (data.C, data.R)),
-        G=np.asarray(system.G), H=np.asarray(system.H), free=~np.isfinite(known),
-        dw=np.asarray(data.dw, np.float64), dv=np.asarray(data.dv, np.float64),
-        ds=state[np.isfinite(state)], dd=known[np.isfinite(known)],
+        F, F_radius, E, E_radius, T2, C, R, np.asarray(system.G), np.asarray(system.H), ~np.isfinite(known),
+        dw, dv, state[np.isfinite(state)], known[np.isfinite(known)],
     )  # fmt: skip
 
 

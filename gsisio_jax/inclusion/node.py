@@ -27,6 +27,7 @@ from jax.core import Tracer
 
 from gsisio_jax import rounding
 from gsisio_jax.interval import Interval, choose, reach
+from gsisio_jax.ties import larger, smaller
 
 _LOSS = 64.0  # in best_form: narrower by less than this many ulps is narrower by rounding
 
@@ -222,7 +223,7 @@ def product(a: Interval, b: Interval) -> Interval:
     """Product of two boxes."""
     p, q = times(a.lower, b.lower), times(a.lower, b.upper)
     r, s = times(a.upper, b.lower), times(a.upper, b.upper)
-    lower, upper = jnp.minimum(jnp.minimum(p, q), jnp.minimum(r, s)), jnp.maximum(jnp.maximum(p, q), jnp.maximum(r, s))
+    lower, upper = smaller(smaller(p, q), smaller(r, s)), larger(larger(p, q), larger(r, s))
     return Interval.unchecked(rounding.down(lower), rounding.up(upper))
 
 
@@ -310,7 +311,7 @@ def meet(node: Node) -> Node:
     if node.form is None:
         return node
     natural, image = node.range, node.form.image()
-    lower, upper = jnp.maximum(natural.lower, image.lower), jnp.minimum(natural.upper, image.upper)
+    lower, upper = larger(natural.lower, image.lower), smaller(natural.upper, image.upper)
     return Node(choose(lower <= upper, Interval.unchecked(lower, upper), natural), node.form, node.jac)
 
 

@@ -34,7 +34,8 @@ from gsisio_jax import rounding
 from gsisio_jax.inclusion.elementary import LIMIT
 from gsisio_jax.inclusion.node import Node, best_form, guard, product, scaled_slack, slope_reach, times
 from gsisio_jax.inclusion.waves import Wave, crosses
-from gsisio_jax.interval import Interval, choose, entire_like, larger, smaller
+from gsisio_jax.interval import Interval, choose, entire_like
+from gsisio_jax.ties import larger, smaller
 
 INF = math.inf
 # Below this relative width a secant is mostly rounding; the tangent at the middle is as good there.
@@ -195,7 +196,7 @@ class Curve:
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
         low, high = self.phi.domain
-        a, b = jnp.maximum(a, low), jnp.minimum(b, high)
+        a, b = larger(a, low), smaller(b, high)
         finite = jnp.isfinite(a) & jnp.isfinite(b) & (a <= b)
         a, b = jnp.where(finite, a, self.phi.inner), jnp.where(finite, b, self.phi.inner)
         pa, pb = self.phi.at(a), self.phi.at(b)

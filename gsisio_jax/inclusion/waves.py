@@ -14,6 +14,7 @@ import numpy as np
 from gsisio_jax import rounding
 from gsisio_jax.inclusion.elementary import LIMIT, SLOT, sin_cos
 from gsisio_jax.interval import Interval, choose
+from gsisio_jax.ties import larger, smaller
 
 _PERIOD = 6.28  # a little less than 2 pi
 
@@ -57,10 +58,10 @@ class Wave:
         # With slope phi'(m) cos(r/2) the odd part of the rest, sin h - h cos(r/2), has its critical points at
         # +-r/2. It is then four times smaller than with the tangent, and no arccosine is needed.
         s = steepness * half_cos
-        odd = jnp.abs(steepness) * jnp.maximum(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
+        odd = jnp.abs(steepness) * larger(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
         even = value * (1 - 2 * half_sin**2)
         shift = s * m
-        lower, upper = jnp.minimum(value, even) - odd - shift, jnp.maximum(value, even) + odd - shift
+        lower, upper = smaller(value, even) - odd - shift, larger(value, even) + odd - shift
         rest = _wave_padded(Interval.unchecked(lower, upper), self.cosine, m, r)
         return jnp.where(usable, s, 0), choose(usable, rest, natural)
 

@@ -27,6 +27,8 @@ PER_WORKER = 2  # tiles in flight: one that runs and one that is ready to
 LOSSES = 3  # times that a tile may be lost
 ALONE = 60.0  # seconds without any worker before it is said
 SEEN = 90.0  # seconds that a file of another machine may take to be seen; NFS keeps its folders for 60
+
+
 def check(call: str, client: Any) -> None:
     """Refuse what is no client of a cluster that runs.
 

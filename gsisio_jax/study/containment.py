@@ -15,8 +15,8 @@ from gsisio_jax.observer import StepOutput
 from gsisio_jax.study.reduce import Context, Kept, Variable
 from gsisio_jax.study.truth import Coverage
 
-# Boxes are rounded to nearest, so noise on its very bounds may push the truth out by some units in the last place.
-# Relative to the truth and the width of its box; double and single precision.
+# The simulated plant rounds where the real one would not, so noise on its very bounds may push the truth out of a box
+# by some units in the last place. Relative to the truth and the width of its box; double and single precision.
 SLACK = {True: 1e-9, False: 1e-3}
 
 

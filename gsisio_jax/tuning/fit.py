@@ -97,15 +97,16 @@ def tune_noise(
             f"them, because {evidence.text}, and they never were. Log the true state (`x` of the records), or measure "
             "more."
         )
+    affine = is_affine(observer)
     if len(shape.names) > 1 and not vanished:
-        chosen = method if method != "auto" else ("lp" if is_affine(observer) else "optax")
+        chosen = method if method != "auto" else ("lp" if affine else "optax")
         if chosen == "lp":
-            if not is_affine(observer):
+            if not affine:
                 raise ValueError('tune_noise: `method="lp"` needs f and g to be affine in x; use "optax"')
             searching.linear_program(search)
         else:
             searching.penalty_method(search, iterations, optimizer)
-    return _result(search, first, everything, fitted, chosen, evidence.text)
+    return _result(search, first, everything, fitted, chosen, affine, evidence.text)
 
 
 def _check(observer: Any, records: Any, objective: str, method: str, tolerance: float, iterations: int) -> None:
@@ -178,7 +179,7 @@ def _start(shape: Shape, start: TunedNoise | Noise | None) -> np.ndarray:
 
 
 def _result(
-    search: Search, first: np.ndarray, records: Records, fitted: np.ndarray, method: str, explained: str
+    search: Search, first: np.ndarray, records: Records, fitted: np.ndarray, method: str, affine: bool, explained: str
 ) -> TunedNoise:
     names = search.scores.shape.names
     score = search.scores.values(search.best[None])
@@ -194,7 +195,7 @@ def _result(
             f"the records do not need {', '.join(zero)}: the other bounds explain them alone. That is no evidence that "
             "these are small"
         )
-    if method == "optax":
+    if method == "optax" and not affine:
         notes.append("this system is not linear: the result is a local optimum")
     history = {key: np.array([row[key] for row in search.history]) for key in search.history[0]}
     return TunedNoise(

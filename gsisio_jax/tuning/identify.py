@@ -65,5 +65,5 @@ def is_affine(observer: Observer) -> bool:
     if not observer.first.affine_output:
         return False
     u = observer.u_region if system.takes_u else Interval(np.zeros(system.m), np.zeros(system.m))
-    jacobian = inclusion.jacobian(system.maps)(system.state_bounds, u)
+    jacobian = inclusion.jacobian(system.maps, "nearest")(system.state_bounds, u)
     return bool(np.array_equal(np.asarray(jacobian.lower), np.asarray(jacobian.upper)))

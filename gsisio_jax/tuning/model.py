@@ -9,7 +9,7 @@ import numpy as np
 
 from gsisio_jax import inclusion
 from gsisio_jax.interval import Interval
-from gsisio_jax.observer import FirstSweep, Observer
+from gsisio_jax.observer import Observer
 from gsisio_jax.system import System
 
 
@@ -17,7 +17,8 @@ def with_model(observer: Observer, system: System) -> Observer:
     """The same gains on another f and g: everything that the design derived from f and g is computed anew.
 
     Any gain that cancels the unknown input is sound for every f and g, because the slopes C are a choice. What rests on
-    enclosures of the derivatives does change: how a step begins, and the certificate.
+    enclosures of the derivatives does change: how a step begins, and the certificate. What rounding leaves of the gains
+    is known for given numbers only, so the result rounds to nearest.
 
     Args:
         observer: designed for a system with the same matrices and bounds.
@@ -45,22 +46,22 @@ def with_model(observer: Observer, system: System) -> Observer:
 
     def reach(box: Interval) -> jnp.ndarray:
         """R: bound of the derivative of T2 g(x) - C x."""
-        slope = inclusion.jacobian(outputs)(box, u_region)
+        slope = inclusion.jacobian(outputs, "nearest")(box, u_region)
         return jnp.maximum(jnp.abs(slope.lower - observer.C), jnp.abs(slope.upper - observer.C))
 
     form = first.form
     if form is not None:
-        form = inclusion.affine(outputs)(old.state_bounds, jnp.zeros(old.m))
+        form = inclusion.affine(outputs, "nearest")(old.state_bounds, jnp.zeros(old.m))
     # Where T2 g was affine with slope C, psi was 0 and is not any more.
-    inverses, affine_output = first.inverses, False
+    first = replace(first, form=form, linear=(), affine_output=False)
     if first.gains:
         whole = reach(old.state_bounds)
         weights = jnp.stack([jnp.abs(jnp.asarray(observer.gains.remainder[k])) for k in first.gains])
-        inverses = jnp.linalg.inv(jnp.eye(n, dtype=whole.dtype) - weights @ whole)
-    changed = replace(observer, system=system, first=FirstSweep(form, inverses, first.gains, affine_output))
+        first = replace(first, inverses=jnp.linalg.inv(jnp.eye(n, dtype=whole.dtype) - weights @ whole))
+    changed = replace(observer, system=system, first=first, rounding="nearest")
     if not certificate.promised:
         return changed
-    slopes = inclusion.jacobian(system.maps)(certificate.region, u_region)
+    slopes = inclusion.jacobian(system.maps, "nearest")(certificate.region, u_region)
     center, radius = 0.5 * (slopes.lower + slopes.upper), 0.5 * (slopes.upper - slopes.lower)
 
     def spread(rows: object) -> jnp.ndarray:
@@ -70,7 +71,9 @@ def with_model(observer: Observer, system: System) -> Observer:
     implicit = jnp.abs(jnp.asarray(observer.gains.remainder[0])) @ reach(certificate.region)
     growth = spread(observer.gains.residual[0])
     before = spread(observer.inverses.residual[0])
-    promise = replace(certificate, growth=growth, implicit=implicit, input_state_before=before)
     return replace(
-        changed, certificate=promise, region_inverse=jnp.linalg.inv(jnp.eye(n, dtype=growth.dtype) - implicit)
+        changed,
+        certificate=replace(certificate, growth=growth, implicit=implicit, input_state_before=before),
+        guard=replace(observer.guard, growth=growth, input_growth=before),
+        region_inverse=jnp.linalg.inv(jnp.eye(n, dtype=growth.dtype) - implicit),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ import numpy as np
 from gsisio_jax import estimation
 from gsisio_jax.interval import Interval
 from gsisio_jax.observer import Observer, cast
+from gsisio_jax.tuning.compiled import quickly
 from gsisio_jax.tuning.fold import fold_rows
 from gsisio_jax.tuning.records import Records
 from gsisio_jax.tuning.shape import Shape
@@ -81,7 +83,6 @@ def _slack(box: Interval, value: Any, room: Any) -> Any:
     return jnp.where(jnp.isfinite(slack), slack, jnp.inf).min(initial=jnp.inf)
 
 
-@jax.jit
 def _values(observer: Observer, noise: Any, records: Any, room: Any) -> Score:
     def one(noise: Any) -> Score:
         return jax.vmap(lambda record: score_record(observer, noise, record, room))(records)
@@ -89,7 +90,6 @@ def _values(observer: Observer, noise: Any, records: Any, room: Any) -> Score:
     return jax.vmap(one)(noise)
 
 
-@jax.jit
 def _gradients(observer: Observer, noise: Any, records: Any, room: Any, mix: Any) -> Any:
     """Value and gradient, record by record, of the penalty (mix 1) or of the first violation (mix 0)."""
 
@@ -98,6 +98,15 @@ def _gradients(observer: Observer, noise: Any, records: Any, room: Any, mix: Any
         return jnp.where(mix, score.penalty, jnp.where(jnp.isfinite(score.first), score.first, 0)), score
 
     return jax.vmap(jax.value_and_grad(one, has_aux=True), in_axes=(None, 0))(noise, records)
+
+
+SMALL = 5000  # rows of all records together up to which compiling costs more than running
+
+
+@cache
+def _program(gradients: bool, small: bool) -> Any:
+    function = _gradients if gradients else _values
+    return quickly(function) if small else jax.jit(function)
 
 
 class Scores:
@@ -122,13 +131,15 @@ class Scores:
         self._chosen = jax.tree.map(lambda a: a[index], self._records)
         self._room = jnp.asarray(room, dtype)
         self._dtype = dtype
+        self._rows = len(records) * records.y.shape[1]
 
     def values(self, factors: np.ndarray) -> Score:
         """Scores of several factors (points, k), at most `POINTS`: arrays (points, R) over all records."""
         points = len(factors)
         full = np.concatenate([factors, np.repeat(factors[-1:], POINTS - points, axis=0)])
         # The compiled programs know bounds, not factors: another parametrisation compiles nothing.
-        score = _values(self._observer, self.shape.noise(full).astype(self._dtype), self._records, self._room)
+        program = _program(False, self._rows <= SMALL)
+        score = program(self._observer, self.shape.noise(full).astype(self._dtype), self._records, self._room)
         self.calls += points
         return Score(*(np.asarray(a)[:points] for a in score))
 
@@ -139,6 +150,7 @@ class Scores:
     def gradient(self, factors: np.ndarray, penalty: bool) -> tuple[np.ndarray, np.ndarray, Score]:
         """Of the penalties, or of the first violations, of the fitted records: (R,), (R, k), and the scores."""
         noise = self.shape.noise(factors).astype(self._dtype)
-        (value, score), slope = _gradients(self._observer, noise, self._chosen, self._room, jnp.asarray(penalty))
+        program = _program(True, self._rows <= SMALL)
+        (value, score), slope = program(self._observer, noise, self._chosen, self._room, jnp.asarray(penalty))
         self.calls += 1
         return np.asarray(value), self.shape.pull(slope), Score(*map(np.asarray, score))

@@ -113,7 +113,8 @@ def linear_program(search: Search, rounds: int = 80) -> None:
     With f and g affine and fixed gains every upper bound, and the negative of every lower bound, is a minimum of sums
     of others with nonnegative weights: concave in the factors. So is the slack of every intersection, and its gradient
     at an infeasible point is a cut that holds for all feasible factors. Every cut enters a linear program of k
-    unknowns, whose optimum is a lower bound; the way from there to a point inside gives a feasible point and the next cuts.
+    unknowns, whose optimum is a lower bound; the way from there to a point inside gives a feasible point and the next
+    cuts.
 
     Raises:
         MissingExtra: SciPy is not installed.

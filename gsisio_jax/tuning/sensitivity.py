@@ -15,6 +15,7 @@ from gsisio_jax._extras import need
 from gsisio_jax.interval import Interval
 from gsisio_jax.observer import Observer
 from gsisio_jax.system import Noise, System
+from gsisio_jax.tuning.compiled import quickly
 from gsisio_jax.tuning.fold import fold_rows
 from gsisio_jax.tuning.model import with_model
 
@@ -91,7 +92,7 @@ def width_sensitivity(
         return found, found
 
     # Forward mode: a few inputs, a few results, and no memory of the steps.
-    slopes, found = jax.jit(jax.jacfwd(widths, has_aux=True))(jnp.zeros(sum(sizes), y.dtype))
+    slopes, found = quickly(jax.jacfwd(widths, has_aux=True))(jnp.zeros(sum(sizes), y.dtype))
     certified, by_bound = _certificate(observer, bounds, model, parameters, rebuild)
     width = np.concatenate([np.asarray(found), certified[None]])
     derivative = np.concatenate([np.asarray(slopes), by_bound[None]])

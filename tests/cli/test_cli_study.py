@@ -218,7 +218,16 @@ def test_the_old_store_goes_only_once_the_new_one_is_there(tmp_path):
         assert (store / "new").exists()
 
 
-def test_ctrl_c_keeps_the_finished_tiles_and_the_same_command_goes_on(done, no_pictures):
+@pytest.fixture
+def interruptible():
+    """A process that was started in the background ignores Ctrl-C, and so would what it starts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible", "no_pictures")
+def test_ctrl_c_keeps_the_finished_tiles_and_the_same_command_goes_on(done):
     config = done.path / "long.toml"
     many = "from = 1\nto = 4\ncount = 100"
     config.write_text(Path(done.config).read_text().replace("scale = [1, 2, 4]", many))
@@ -258,6 +267,7 @@ def test_ctrl_c_keeps_the_finished_tiles_and_the_same_command_goes_on(done, no_p
                 np.testing.assert_array_equal(here, there)
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_signals_are_heard_and_handlers_put_back():
     before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
 

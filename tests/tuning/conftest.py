@@ -43,3 +43,11 @@ def axis() -> Axis:
 
     run = jax.vmap(one)(jax.random.split(jax.random.key(0), 6))
     return Axis(observer, gx.Interval.symmetric(np.ones(2)), np.asarray(run.x), np.asarray(run.y))
+
+
+@pytest.fixture(scope="session")
+def small() -> gx.Observer:
+    """One state, no unknown input: what costs the least to compile."""
+    system = gx.System(lambda x: 0.9 * x, lambda x: x, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
+    noise = gx.Noise(gx.Interval.symmetric([0.05]), gx.Interval.symmetric([0.1]))
+    return gx.design_observer(system, noise, gx.Interval.entire(1), missing=False)

@@ -43,6 +43,7 @@ def test_reaches_the_optimum_of_the_linear_program(fitted, oracle):
 def test_the_penalty_reaches_it_as_well(axis, oracle):
     found = tune_noise(axis.observer, axis.records, weights=WEIGHTS, method="optax", iterations=200)
     assert found.method == "optax"
+    assert not any("local" in note for note in found.notes)
     assert oracle[0] * (1 - 1e-5) <= found.cost <= 1.01 * oracle[0]
 
 
