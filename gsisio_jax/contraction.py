@@ -151,14 +151,13 @@ class Bank(eqx.Module):
     def explicit(self, h: AffineForm, x_before: Interval, terms: Terms) -> Interval:
         """All terms but those in x[k]: box (K, r). Slopes are combined before the box is applied, so that what
         cancels cancels exactly; that is what keeps widths finite on nonlinear systems (design 4.3, step 2)."""
-        parts = self.residual[..., None] * h.slope
-        slope = add_up(parts, -2)
+        slope = once(add_up(self.residual[..., None] * h.slope, -2))
         low, high = products(slope, x_before)
         offset_low, offset_high = products(self.residual, h.offset)
         joint = Interval.unchecked(add_up(low) + add_up(offset_low), add_up(high) + add_up(offset_high))
         if rounding.outward():
             # Of the slopes before they cancelled.
-            lost = add_up(scale(add_up(abs(parts), -2), reach(x_before)[..., None, :]))
+            lost = _reached(abs(self.residual), once(_reached(abs(h.slope), reach(x_before))))
             n = 1.0 * sum(h.slope.shape) + 8
             joint = Interval.unchecked(
                 rounding.lowered(joint.lower, lost + add_up(abs(offset_low)), n, n),

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_SHORT = 8
+_SHORT = 16
 
 
 @jax.custom_jvp
