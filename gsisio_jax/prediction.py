@@ -19,8 +19,8 @@ from gsisio_jax.contraction import Evidence, magnitude
 from gsisio_jax.inclusion.abstraction import Abstraction
 from gsisio_jax.inclusion.methods import bound
 from gsisio_jax.interval import Interval, choose, intersect, mended, scale
+from gsisio_jax.measured import current_input, in_box, inside, output_box
 from gsisio_jax.observer import Carry, StepOutput, cast
-from gsisio_jax.recursion import current_input, in_box, inside, output_box
 from gsisio_jax.rounding import Rounding
 from gsisio_jax.status import Source, Status, bit_mask
 from gsisio_jax.system import Noise, System

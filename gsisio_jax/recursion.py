@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax import inclusion, rounding
+from gsisio_jax import rounding
 from gsisio_jax.contraction import Bank, Evidence, Slips, Terms, centred, magnitude, solve_remainder, strips
 from gsisio_jax.fusion import multiplied, once
 from gsisio_jax.inclusion import AffineForm
@@ -31,9 +31,10 @@ from gsisio_jax.interval import (
     spread,
     widen,
 )
+from gsisio_jax.measured import current_input, in_box, inside, output_box, point, value_at
 from gsisio_jax.observer import Carry, Observer, StepOutput
 from gsisio_jax.status import Source, Status, bit_mask
-from gsisio_jax.system import Noise, System
+from gsisio_jax.system import Noise
 from gsisio_jax.ties import smaller
 
 
@@ -77,7 +78,7 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
 
     # What is known beforehand, as boxes: everything of identity (*) but h(x[k-1]) and psi(x[k]).
     output = output_box(system, y, u, noise.v)
-    drift = add(image(system.B, _point(carry.u)), carry.noise.w)
+    drift = add(image(system.B, point(carry.u)), carry.noise.w)
     seen = output_box(system, carry.y, carry.u, carry.noise.v)
     shift = Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
     terms = Terms(
@@ -215,7 +216,7 @@ def _certified(
     promised = _Promised(applies, c, jnp.where(applies, far, 0), None, terms)
     if not certificate.promised:
         return evidence, promised
-    promised = promised._replace(value=_value(system.maps, c, u_before))
+    promised = promised._replace(value=value_at(system.maps, c, u_before))
     gain = jax.tree.map(lambda x: x[0], observer.gains)
     around = widen(
         _around(gain, observer.guard.growth, promised), _first(missed.of(observer.guard.gains, evidence.box))
@@ -259,13 +260,6 @@ def _around(row: Bank, slope: Any, promised: _Promised) -> Interval:
     """
     at = image(row.residual, promised.value)
     return add(widen(at, spread(slope, promised.radius)), row.linear(promised.terms))
-
-
-def _value(function: Any, x: Any, *args: Any) -> Interval:
-    """A function at a point, as a box."""
-    if rounding.outward():
-        return inclusion.natural(function)(_point(x), *args)
-    return _point(function(x, *args).astype(x.dtype))
 
 
 def _first(radius: Any) -> Any:
@@ -349,27 +343,6 @@ def _finish(
     return Carry(state, h, y_kept, u, noise), StepOutput(state, d, d_now, bit_mask(bits), *evidence.tightest())
 
 
-def current_input(current: Any, h: AffineForm, state: Interval, output: Interval) -> Interval:
-    """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
-    n, weights = state.shape[0], -current
-    slope = once(multiplied(weights, h.slope[n:]))
-    joint = add(image(slope, state), image(weights, h.offset[n:]))
-    if rounding.outward():
-        lost = slip(abs(weights), slip(abs(h.slope[n:]), reach(state)))  # of the slopes before they cancelled
-        joint = widen(joint, rounding.error(lost, h.slope.shape[0] - n + 6.0))
-    return mended(add(intersect(joint, image(weights, h.range[n:]))[0], image(current, output)))
-
-
-def output_box(system: System, y: Any, u: Any, v: Interval) -> Interval:
-    """Box of ``y - D u - v``: of ``g(x) + H d``; all of R where y is NaN (or infinite: batches cannot refuse it)."""
-    missing = ~jnp.isfinite(y)
-    seen = jnp.where(missing, 0, y)
-    known = add(_point(seen), Interval.unchecked(-v.upper, -v.lower))
-    if system.m:
-        known = add(known, image(-system.D, _point(u)))
-    return choose(missing, entire_like(known), known)
-
-
 def _free_output(observer: Observer, box: Interval, u: Any) -> AffineForm:
     """Bounds of T2 g on a box of x[k]."""
     return bound(_free_map(observer), observer.bounds, observer.output_abstraction)(box, u)
@@ -397,25 +370,11 @@ def _psi(observer: Observer, u: Any) -> Any:
 def _psi_box(observer: Observer, u: Any) -> Any:
     """The same at a point, as a box."""
     if not rounding.outward():
-        return lambda x: _point(_psi(observer, u)(x))
+        return lambda x: point(_psi(observer, u)(x))
 
     def box(x: Any) -> Interval:
-        g = _value(observer.system.measurement, x, u)
+        g = value_at(observer.system.measurement, x, u)
         sides = (jnp.concatenate([g.lower, x]), jnp.concatenate([g.upper, x]))
         return image(jnp.concatenate([observer.T2, -observer.C], axis=1), Interval.unchecked(*sides))
 
     return box
-
-
-def _point(value: Any) -> Interval:
-    return Interval.unchecked(value, value)
-
-
-def inside(box: Interval, region: Interval) -> Any:
-    """Does the whole box lie in the region?"""
-    return ((region.lower <= box.lower) & (box.upper <= region.upper)).all()
-
-
-def in_box(point: Any, box: Interval) -> Any:
-    """For a known input: do the design's enclosures of the derivatives hold for it?"""
-    return inside(_point(point), box)

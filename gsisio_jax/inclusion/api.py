@@ -12,25 +12,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gsisio_jax.fusion import add_up
+from gsisio_jax.inclusion.boxes import guard, is_known, is_point, product, shift, slope_image, sum_slack
 from gsisio_jax.inclusion.interpreter import evaluate
-from gsisio_jax.inclusion.node import (
-    THIN,
-    Domain,
-    Form,
-    Node,
-    as_node,
-    guard,
-    is_known,
-    is_node,
-    is_point,
-    jac_of,
-    product,
-    shift,
-    slack_of,
-    slope_image,
-    slope_of,
-    sum_slack,
-)
+from gsisio_jax.inclusion.node import THIN, Domain, Form, Node, as_node, is_node, jac_of, slack_of, slope_of
 from gsisio_jax.interval import Interval, choose
 from gsisio_jax.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
 

@@ -11,27 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import rounding
+from gsisio_jax.inclusion.boxes import added_slack, moderate, product, scaled_slack, shift, stretch, sum_slack, times
 from gsisio_jax.inclusion.curves import CURVES, RECIPROCAL, SQUARE, power
 from gsisio_jax.inclusion.linear import add, move, multiple, structural, total
-from gsisio_jax.inclusion.node import (
-    Node,
-    added_slack,
-    as_node,
-    best_form,
-    is_node,
-    join,
-    meet,
-    moderate,
-    parts,
-    product,
-    scaled_slack,
-    settled,
-    shift,
-    slope_of,
-    stretch,
-    sum_slack,
-    times,
-)
+from gsisio_jax.inclusion.node import Node, as_node, best_form, is_node, join, meet, parts, settled, slope_of
 from gsisio_jax.inclusion.univariate import apply, extremes
 from gsisio_jax.interval import Interval, choose, entire_like, is_concrete
 

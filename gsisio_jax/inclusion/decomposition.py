@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.api import AffineForm, affine
-from gsisio_jax.inclusion.node import times
+from gsisio_jax.inclusion.boxes import times
 from gsisio_jax.inclusion.rows import Rows, check_derivative, room
 from gsisio_jax.interval import Interval
 from gsisio_jax.rounding import Rounding, as_nearest, rounded_by

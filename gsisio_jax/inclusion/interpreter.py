@@ -21,18 +21,16 @@ from jax.core import Tracer
 
 from gsisio_jax import rounding
 from gsisio_jax.inclusion import linear, logic
+from gsisio_jax.inclusion.boxes import fold, is_known, known_if_concrete
 from gsisio_jax.inclusion.node import (
     THIN,
     Form,
     Node,
     as_node,
     chain,
-    fold,
-    is_known,
     is_node,
     jac_of,
     join,
-    known_if_concrete,
     parts,
     settle,
     settled,

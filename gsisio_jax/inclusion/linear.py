@@ -15,30 +15,32 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import rounding
+from gsisio_jax.inclusion.boxes import (
+    added_slack,
+    fold,
+    is_known,
+    is_point,
+    known_if_concrete,
+    product,
+    scaled_slack,
+    shift,
+    stretch,
+    sum_slack,
+)
 from gsisio_jax.inclusion.node import (
     THIN,
     Form,
     Node,
-    added_slack,
     as_node,
     chain,
-    fold,
-    is_known,
     is_node,
-    is_point,
     jac_of,
     join,
-    known_if_concrete,
     meet,
     parts,
-    product,
-    scaled_slack,
     settled,
-    shift,
     slack_of,
     slope_of,
-    stretch,
-    sum_slack,
     unsettled,
 )
 from gsisio_jax.interval import Interval, is_concrete

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from gsisio_jax import rounding
 from gsisio_jax.inclusion.bilinear import divide, multiply, pick
+from gsisio_jax.inclusion.boxes import shift, slope_image, sum_slack
 from gsisio_jax.inclusion.curves import RELU, SOFTPLUS
 from gsisio_jax.inclusion.linear import add, negative, structural, subtract
 from gsisio_jax.inclusion.node import (
@@ -29,11 +30,8 @@ from gsisio_jax.inclusion.node import (
     meet,
     parts,
     settled,
-    shift,
     slack_of,
-    slope_image,
     slope_of,
-    sum_slack,
 )
 from gsisio_jax.inclusion.univariate import apply
 from gsisio_jax.interval import Interval, choose, entire_like, hull

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsisio_jax import rounding
 from gsisio_jax.inclusion.api import _typed, distance, jacobian, natural
-from gsisio_jax.inclusion.node import guard, times
+from gsisio_jax.inclusion.boxes import guard, times
 from gsisio_jax.interval import Interval, is_concrete
 
 

@@ -32,8 +32,9 @@ import numpy as np
 
 from gsisio_jax import rounding
 from gsisio_jax.fusion import once
+from gsisio_jax.inclusion.boxes import guard, product, scaled_slack, slope_reach, times
 from gsisio_jax.inclusion.elementary import LIMIT
-from gsisio_jax.inclusion.node import THIN, Node, best_form, guard, product, scaled_slack, settled, slope_reach, times
+from gsisio_jax.inclusion.node import THIN, Node, best_form, settled
 from gsisio_jax.inclusion.waves import Wave, crosses
 from gsisio_jax.interval import Interval, choose, entire_like, held
 from gsisio_jax.ties import larger, smaller
