@@ -199,11 +199,12 @@ def in_type(observer: Observer, dtype: Any) -> Observer:
 
 
 def cast(tree: Any, dtype: Any) -> Any:
-    """A pytree of boxes and arrays in another floating type; boxes are rounded outward."""
+    """A pytree of boxes, planes and arrays in another floating type; boxes and planes are rounded outward."""
+    bounds = Interval | Abstraction
     return jax.tree.map(
-        lambda leaf: leaf.astype(dtype) if isinstance(leaf, Interval) else jnp.asarray(leaf, dtype),
+        lambda leaf: leaf.astype(dtype) if isinstance(leaf, bounds) else jnp.asarray(leaf, dtype),
         tree,
-        is_leaf=lambda leaf: isinstance(leaf, Interval),
+        is_leaf=lambda leaf: isinstance(leaf, bounds),
     )
 
 

@@ -10,10 +10,11 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from gsisio_jax import rounding
-from gsisio_jax.interval import Interval, entire_like, products
+from gsisio_jax.interval import Interval, cast_down, cast_up, entire_like, is_concrete, products
 
 
 class Abstraction(eqx.Module):
@@ -86,9 +87,42 @@ class Abstraction(eqx.Module):
         return bounds.astype(box.dtype)
 
     def astype(self, dtype: Any) -> Abstraction:
-        """The same planes in another floating type, rounded to nearest."""
+        """The same planes in another floating type. A narrower one keeps them valid: the outer faces of the region move
+        inward, and offsets leave room for the rounding of the slopes and of the faces between cells.
+        Traced planes are rounded to nearest.
+        """
         dtype = jax.dtypes.canonicalize_dtype(dtype)
-        return jax.tree.map(lambda value: jnp.asarray(value, dtype), self)
+        leaves = jax.tree.leaves(self)
+        fits = all(jnp.finfo(leaf.dtype).bits <= jnp.finfo(dtype).bits for leaf in leaves)
+        if fits or not all(map(is_concrete, leaves)):
+            return jax.tree.map(lambda value: jnp.asarray(value, dtype), self)
+        eps = float(jnp.finfo(dtype).eps)
+        wide: Any = jax.tree.map(lambda value: np.asarray(value, np.float64), self)
+        low, high = wide.region.lower, wide.region.upper
+        cells = tuple(range(low.ndim - 1))
+        first, last = low.min(cells, keepdims=True), high.max(cells, keepdims=True)
+        lower = np.where(low == first, cast_up(low, dtype), low.astype(dtype))
+        upper = np.where(high == last, cast_down(high, dtype), high.astype(dtype))
+        far = np.maximum(np.abs(low), np.abs(high))[..., None, :]
+
+        def room(slope: Any) -> Any:
+            """Of slopes and faces that are each off by half an ulp, with as much again."""
+            return (4 * eps * np.abs(slope) * far).sum(-1) + float(jnp.finfo(dtype).tiny)
+
+        def narrow(value: Any) -> Any:
+            return jnp.asarray(value.astype(dtype))
+
+        return Abstraction(
+            region=Interval.unchecked(narrow(lower), narrow(upper)),
+            lower_slope=narrow(wide.lower_slope),
+            upper_slope=narrow(wide.upper_slope),
+            lower_offset=cast_down(wide.lower_offset - room(wide.lower_slope), dtype),
+            upper_offset=cast_up(wide.upper_offset + room(wide.upper_slope), dtype),
+            theta=narrow(wide.theta),
+            sigma=narrow(wide.sigma),
+            gap=narrow(wide.gap),
+            verified=self.verified,
+        )
 
 
 def _minimum(slope: Any, lower: Any, upper: Any, offset: Any) -> Any:
