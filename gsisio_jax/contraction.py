@@ -14,8 +14,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import rounding
+from gsisio_jax.fusion import add_up, once
 from gsisio_jax.inclusion import AffineForm
-from gsisio_jax.interval import Interval, add, image, intersect, products, reach, scale, spread, widen
+from gsisio_jax.interval import (
+    Interval,
+    add,
+    held,
+    image,
+    intersect,
+    mended,
+    products,
+    reach,
+    scale,
+    slip,
+    spread,
+    widen,
+)
 from gsisio_jax.status import SOURCE_STRIDE, Source
 from gsisio_jax.ties import larger, largest, smaller, smallest
 
@@ -48,7 +62,9 @@ class Evidence(eqx.Module):
         # bound, zero noise), which miss the plant by as much: that is no conflict.
         tolerance = _ROUNDING * jnp.finfo(slack.dtype).eps * self.scale
         slack = jnp.where((slack < 0) & (slack >= -tolerance), 0, slack)
-        return Evidence(self.box, self.scale, (*self.slacks, slack), (*self.sources, codes))
+        if rounding.outward():  # where a side overflowed there is nothing to contradict
+            slack = jnp.where(jnp.isnan(slack), jnp.inf, slack)
+        return Evidence(self.box, self.scale, (*self.slacks, once(slack)), (*self.sources, codes))
 
     def meet(self, others: Interval, kind: Source, by_row: bool = False) -> Evidence:
         """Intersect the box with a stack (k, n) of boxes of the same vector, all at once.
@@ -58,7 +74,7 @@ class Evidence(eqx.Module):
             kind: what they are.
             by_row: the slack is that of each of the k boxes, not of each component.
         """
-        box = self.box
+        box, others = self.box, held(mended(others))
         slack = smaller(box.upper - others.lower, others.upper - box.lower)
         lower = larger(box.lower, largest(others.lower, 0))
         upper = smaller(box.upper, smallest(others.upper, 0))
@@ -66,7 +82,7 @@ class Evidence(eqx.Module):
         apart = jnp.where(upper < lower, upper - lower, jnp.inf)
         tightest = smaller(smallest(slack, 0), apart)
         empty = tightest < 0
-        met = Interval.unchecked(jnp.where(empty, box.lower, lower), jnp.where(empty, box.upper, upper))
+        met = held(Interval.unchecked(jnp.where(empty, box.lower, lower), jnp.where(empty, box.upper, upper)))
         noted = (
             self.weigh(smallest(slack, 1), kind).weigh(apart, Source.STATE) if by_row else self.weigh(tightest, kind)
         )
@@ -136,17 +152,17 @@ class Bank(eqx.Module):
         """All terms but those in x[k]: box (K, r). Slopes are combined before the box is applied, so that what
         cancels cancels exactly; that is what keeps widths finite on nonlinear systems (design 4.3, step 2)."""
         parts = self.residual[..., None] * h.slope
-        slope = parts.sum(-2)
+        slope = add_up(parts, -2)
         low, high = products(slope, x_before)
         offset_low, offset_high = products(self.residual, h.offset)
-        joint = Interval.unchecked(low.sum(-1) + offset_low.sum(-1), high.sum(-1) + offset_high.sum(-1))
+        joint = Interval.unchecked(add_up(low) + add_up(offset_low), add_up(high) + add_up(offset_high))
         if rounding.outward():
             # Of the slopes before they cancelled.
-            lost = scale(abs(parts).sum(-2), reach(x_before)[..., None, :]).sum(-1)
+            lost = add_up(scale(add_up(abs(parts), -2), reach(x_before)[..., None, :]))
             n = 1.0 * sum(h.slope.shape) + 8
             joint = Interval.unchecked(
-                rounding.unbounded(rounding.lowered(joint.lower, lost + abs(offset_low).sum(-1), n, n), -jnp.inf),
-                rounding.unbounded(rounding.raised(joint.upper, lost + abs(offset_high).sum(-1), n, n), jnp.inf),
+                rounding.lowered(joint.lower, lost + add_up(abs(offset_low)), n, n),
+                rounding.raised(joint.upper, lost + add_up(abs(offset_high)), n, n),
             )
         box = intersect(joint, image(self.residual, h.range))[0]
         return add(box, self.linear(terms))
@@ -172,7 +188,7 @@ class Slips(eqx.Module):
 
     def radius(self, x: Any, d: Any) -> Any:
         """How far a bound can be off, (K, r), where ``|x[k]| <= x`` and ``|d[k-1]| <= d``."""
-        return rounding.up(spread(self.x, x) + spread(self.d, d))
+        return slip(self.x, x) + slip(self.d, d)
 
 
 class Terms(eqx.Module):
@@ -257,21 +273,25 @@ def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box:
         D, N, B = abs(difference), abs(N_z), abs(inverse)
         size, n = sum(C.shape) + 4.0, C.shape[1] + 2.0 * C.shape[0]
         # Residual of B, with what its own evaluation loses, and that of D: |D| far is at hand as a vector.
-        thrown = spread(D, far)
+        thrown = _reached(D, far)
         of_inverse = defect + rounding.error(_product(B, jnp.eye(C.shape[0], dtype=D.dtype) + _product(D, N)), size)
-        radius = spread(N, spread(of_inverse, thrown))
+        radius = _reached(N, _reached(of_inverse, thrown))
         # Rounding of M = I - N_z B D, which meets A x, and of D in both: (I + |N||B||D|) (far + |N||D| far).
-        image_of_x = far + spread(N, thrown)
-        touched = image_of_x + spread(N, spread(B, spread(D, image_of_x)))
-        radius = rounding.unbounded(rounding.up(radius + rounding.error(touched, 2 * n)), jnp.inf)
-        solved = widen(solved, radius)
+        image_of_x = far + _reached(N, thrown)
+        touched = image_of_x + _reached(N, _reached(B, _reached(D, image_of_x)))
+        solved = widen(solved, rounding.generous(radius + rounding.error(touched, 2 * n)))
     keep = verified[:, None]
     return Interval.unchecked(jnp.where(keep, solved.lower, -jnp.inf), jnp.where(keep, solved.upper, jnp.inf))
 
 
+def _reached(matrix: Any, reach: Any) -> Any:
+    """`spread` to nearest."""
+    return add_up(scale(matrix, reach[..., None, :]))
+
+
 def _product(a: Any, b: Any) -> Any:
     """Matrix product of stacks of tiny matrices, written out: a batched dot of such sizes is slow."""
-    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+    return add_up(a[..., :, :, None] * b[..., None, :, :], -2)
 
 
 def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
@@ -288,7 +308,7 @@ def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
         work = jnp.concatenate([work[..., :i, :], row, work[..., i + 1 :, :]], axis=-2)
     inverse = work[..., q:]
     defect = jnp.abs(_product(inverse, matrix) - identity)
-    error = defect.sum(-1).max(-1) if q else jnp.zeros(matrix.shape[:-2])
+    error = add_up(defect).max(-1) if q else jnp.zeros(matrix.shape[:-2])
     return inverse, defect, error < _INVERSE_RESIDUAL * jnp.finfo(matrix.dtype).eps
 
 
@@ -299,7 +319,7 @@ def centred(
     remainder: Any,
     bounded_remainder: Any,
     within: Interval,
-    slip: Any = None,
+    left: Any = None,
     rounds: int = 3,
 ) -> Interval:
     """Bound x by its distance from one point c, where ``x + N_z psi(x) in right`` and x lies in `within`.
@@ -311,11 +331,11 @@ def centred(
     Args:
         right: box (n,).
         N_z: (n, q).
-        inverse: V >= 0 with ``V (I - |N_z| R - slip) >= I``, (n, n).
+        inverse: V >= 0 with ``V (I - |N_z| R - left) >= I``, (n, n).
         remainder: the function psi.
         bounded_remainder: the same at a point, as a box (q,).
         within: box (n,) on which R holds and in which x is known to lie.
-        slip: (n, n), what `right` leaves of x by rounding.
+        left: (n, n), what `right` leaves of x by rounding.
         rounds: iterations of c.
 
     Source: design 4.3, steps 3 and 6.
@@ -330,11 +350,10 @@ def centred(
     move = rounding.up(larger(abs(moved.upper - c), abs(c - moved.lower)))
     # The radius is taken from the centre that is really used, so that no side is lost where one is infinite.
     radius = rounding.up(larger(right.upper - middle, middle - right.lower))
-    far = radius + move if slip is None else radius + move + spread(slip, abs(c))
+    far = radius + move if left is None else radius + move + slip(left, abs(c))
     away = spread(inverse, rounding.up(far, 4.0))
     return Interval.unchecked(
-        rounding.unbounded(rounding.lowered(c - away, abs(c) + away, 2.0), -jnp.inf),
-        rounding.unbounded(rounding.raised(c + away, abs(c) + away, 2.0), jnp.inf),
+        rounding.lowered(c - away, abs(c) + away, 2.0), rounding.raised(c + away, abs(c) + away, 2.0)
     )
 
 
@@ -347,4 +366,4 @@ def _clip(value: Any, box: Interval) -> Any:
 
 
 def _vector(matrix: Any, vector: Any) -> Any:
-    return (matrix * vector).sum(-1)
+    return add_up(matrix * vector)

@@ -18,7 +18,7 @@ from gsisio_jax.certificate import Certificate
 from gsisio_jax.contraction import Evidence, magnitude
 from gsisio_jax.inclusion.abstraction import Abstraction
 from gsisio_jax.inclusion.methods import bound
-from gsisio_jax.interval import Interval, choose, intersect, scale
+from gsisio_jax.interval import Interval, choose, intersect, mended, scale
 from gsisio_jax.observer import Carry, StepOutput, cast
 from gsisio_jax.recursion import current_input, in_box, inside, output_box
 from gsisio_jax.rounding import Rounding
@@ -110,7 +110,7 @@ def _rows(matrix: Any, value: Any, size: int) -> Interval:
     terms = scale(matrix, jnp.where(finite, value, 0))
     lost = ((matrix != 0) & ~finite).any(-1)
     upper, lower = rounding.sum_up(terms)[:size], rounding.sum_down(terms)[size:]
-    return Interval.unchecked(jnp.where(lost[size:], -jnp.inf, lower), jnp.where(lost[:size], jnp.inf, upper))
+    return mended(Interval.unchecked(jnp.where(lost[size:], -jnp.inf, lower), jnp.where(lost[:size], jnp.inf, upper)))
 
 
 def _finish(

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 
 from gsisio_jax import inclusion, rounding
 from gsisio_jax.contraction import Bank, Evidence, Slips, Terms, centred, magnitude, solve_remainder, strips
+from gsisio_jax.fusion import add_up
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.methods import bound
-from gsisio_jax.interval import Interval, add, choose, entire_like, image, intersect, reach, spread, widen
+from gsisio_jax.interval import Interval, add, choose, entire_like, image, intersect, mended, reach, slip, spread, widen
 from gsisio_jax.observer import Carry, Observer, StepOutput
 from gsisio_jax.status import Source, Status, bit_mask
 from gsisio_jax.system import Noise, System
@@ -121,11 +122,11 @@ class _Missed:
         self.inputs = jnp.full_like(self.limit, jnp.inf)
         if rounding.outward():
             for i, j in enumerate(guard.direct):
-                self.inputs = jnp.minimum(self.inputs, spread(guard.input_inverses[i], reach(d_fixed[j])))
+                self.inputs = jnp.minimum(self.inputs, slip(guard.input_inverses[i], reach(d_fixed[j])))
 
     def input_reach(self, box: Interval) -> Any:
         """Bound of ``|d[k-1]|``, (p,), from a box of x[k]."""
-        return jnp.minimum(self.limit, rounding.up(self.inputs + spread(self.guard.input_state, reach(box))))
+        return jnp.minimum(self.limit, self.inputs + slip(self.guard.input_state, reach(box)))
 
     def of(self, slips: Slips, box: Interval) -> Any:
         """Radius (K, r) by which a bank's bounds are to be widened; None to nearest."""
@@ -135,7 +136,7 @@ class _Missed:
 
     def of_inputs(self, weights: Any, box: Interval) -> Any:
         """The same for rows that leave only d[k-1], (..., p)."""
-        return spread(weights, self.input_reach(box)) if rounding.outward() else None
+        return slip(weights, self.input_reach(box)) if rounding.outward() else None
 
 
 def _meet_first_boxes(observer: Observer, evidence: Evidence, right: Interval, missed: _Missed, u: Any) -> Evidence:
@@ -145,13 +146,13 @@ def _meet_first_boxes(observer: Observer, evidence: Evidence, right: Interval, m
     if rounding.outward():
         # What d leaves, but for its part in x[k], which is in the slips of `first`.
         inputs = jnp.minimum(missed.inputs, missed.limit)
-        right = widen(right, spread(guard.gains.d, inputs))
+        right = widen(right, slip(guard.gains.d, inputs))
     if first.gains:
-        chosen, N_z, slips = _taken(first.gains, right, gains.remainder, first.slips)
+        chosen, N_z, left = _taken(first.gains, right, gains.remainder, first.slips)
         bounded = _psi_box(observer, u)
         boxes = jax.vmap(
-            lambda box, N, V, slip: centred(box, N, V, _psi(observer, u), bounded, observer.system.state_bounds, slip)
-        )(chosen, N_z, first.inverses, slips)
+            lambda box, N, V, L: centred(box, N, V, _psi(observer, u), bounded, observer.system.state_bounds, L)
+        )(chosen, N_z, first.inverses, left)
         boxes = choose(in_box(u, observer.u_region), boxes, entire_like(boxes))
         evidence = evidence.meet(boxes, Source.STATE)
     if first.linear and first.form is not None:
@@ -159,7 +160,7 @@ def _meet_first_boxes(observer: Observer, evidence: Evidence, right: Interval, m
         boxes = image(first.maps, add(chosen, image(-N_z, first.form.offset)))
         if rounding.outward():
             far = jnp.minimum(spread(first.bounds, reach(boxes)), reach(evidence.box))
-            boxes = widen(boxes, spread(first.left, far))
+            boxes = widen(boxes, slip(first.left, far))
         evidence = evidence.meet(boxes, Source.STATE)
     return evidence
 
@@ -188,7 +189,7 @@ def _certified(
     u: Any,
 ) -> tuple[Evidence, _Promised]:
     """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""
-    certificate, region = observer.certificate, observer.certificate.region
+    certificate, region, system = observer.certificate, observer.certificate.region, observer.system
     applies = jnp.asarray(False)
     if certificate.promised:
         applies = inside(before, region) & inside(evidence.box, region)
@@ -196,12 +197,13 @@ def _certified(
     # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
     c = jnp.where(applies, before.center, region.center)
     far = rounding.up(jnp.maximum(before.upper - c, c - before.lower))
-    promised = _Promised(applies, c, jnp.where(applies, far, 0), u_before, terms)
+    promised = _Promised(applies, c, jnp.where(applies, far, 0), None, terms)
     if not certificate.promised:
         return evidence, promised
+    promised = promised._replace(value=_value(system.maps, c, u_before))
     gain = jax.tree.map(lambda x: x[0], observer.gains)
     around = widen(
-        _around(observer, gain, observer.guard.growth, promised), _first(missed.of(observer.guard.gains, evidence.box))
+        _around(gain, observer.guard.growth, promised), _first(missed.of(observer.guard.gains, evidence.box))
     )
     joint, slack = intersect(right[0], around)
     evidence = evidence.weigh(jnp.where(applies, slack, jnp.inf), Source.STATE)
@@ -218,36 +220,37 @@ def _certified_input(
     if not certificate.promised or not observer.system.p:
         return d, evidence
     inverse = jax.tree.map(lambda x: x[0], observer.inverses)
-    around = _around(observer, inverse, observer.guard.input_growth, promised)
+    around = _around(inverse, observer.guard.input_growth, promised)
     around = widen(around, _first(missed.of(observer.guard.inverses, evidence.box)))
     box = add(image(inverse.state, evidence.box), around)
-    met, slack = intersect(d, choose(promised.applies, box, entire_like(box)))
+    met, slack = intersect(d, choose(promised.applies, mended(box), entire_like(box)))
     return met, evidence.weigh(slack, Source.INPUT)
 
 
 class _Promised(NamedTuple):
-    """Where the promise of the certificate applies, and the old box there: centre and radius."""
+    """Where the promise of the certificate applies; the old box there, by centre and radius; [f; g] at that centre."""
 
     applies: Any
     center: Any
     radius: Any
-    u_before: Any
+    value: Any
     terms: Terms
 
 
-def _around(observer: Observer, row: Bank, slope: Any, promised: _Promised) -> Interval:
+def _around(row: Bank, slope: Any, promised: _Promised) -> Interval:
     """A linear bound without its terms in x[k]: its value at the centre of the old box, give or take ``slope radius``.
 
     No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
     """
-    maps, center = observer.system.maps, promised.center
-    outward = rounding.outward()
-    at = (
-        inclusion.natural(maps)(_point(center), promised.u_before)
-        if outward
-        else _point(maps(center, promised.u_before).astype(center.dtype))
-    )
-    return add(widen(image(row.residual, at), spread(slope, promised.radius)), row.linear(promised.terms))
+    at = image(row.residual, promised.value)
+    return add(widen(at, spread(slope, promised.radius)), row.linear(promised.terms))
+
+
+def _value(function: Any, x: Any, *args: Any) -> Interval:
+    """A function at a point, as a box."""
+    if rounding.outward():
+        return inclusion.natural(function)(_point(x), *args)
+    return _point(function(x, *args).astype(x.dtype))
 
 
 def _first(radius: Any) -> Any:
@@ -259,11 +262,11 @@ def _inputs(observer: Observer, evidence: Evidence, fixed: Interval, form: Affin
     inverses, box = observer.inverses, evidence.box
     # state x[k] - remainder psi(x[k]) with psi = (S - C) x + [e], slopes combined before the box is applied.
     parts = inverses.remainder[..., None] * (form.slope - observer.C)
-    slope = inverses.state - parts.sum(-2)
+    slope = inverses.state - add_up(parts, -2)
     now = add(image(slope, box), image(-inverses.remainder, form.offset), fixed)
     if rounding.outward():
         # Of the slopes before they cancelled.
-        lost = spread(abs(inverses.state) + abs(parts).sum(-2), reach(box))
+        lost = slip(abs(inverses.state) + add_up(abs(parts), -2), reach(box))
         now = widen(now, rounding.error(lost, parts.shape[-2] + 6.0))
     d = Evidence(observer.system.input_bounds, evidence.scale).meet(now, Source.INPUT)
     return d.box, evidence.weigh(d.slacks[0], Source.INPUT) if d.slacks else evidence
@@ -335,11 +338,11 @@ def current_input(current: Any, h: AffineForm, state: Interval, output: Interval
     """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
     n, weights = state.shape[0], -current
     parts = weights[..., None] * h.slope[n:]
-    joint = add(image(parts.sum(-2), state), image(weights, h.offset[n:]))
+    joint = add(image(add_up(parts, -2), state), image(weights, h.offset[n:]))
     if rounding.outward():
-        lost = spread(abs(parts).sum(-2), reach(state))  # of the slopes before they cancelled
+        lost = slip(add_up(abs(parts), -2), reach(state))  # of the slopes before they cancelled
         joint = widen(joint, rounding.error(lost, parts.shape[-2] + 6.0))
-    return add(intersect(joint, image(weights, h.range[n:]))[0], image(current, output))
+    return mended(add(intersect(joint, image(weights, h.range[n:]))[0], image(current, output)))
 
 
 def output_box(system: System, y: Any, u: Any, v: Interval) -> Interval:
@@ -364,7 +367,7 @@ def _first_form(observer: Observer, box: Interval, u: Any) -> AffineForm:
         return inclusion.affine(_free_map(observer))(observer.system.state_bounds, u)
     if not rounding.outward():
         return known
-    return AffineForm(known.slope, widen(known.offset, spread(observer.first.slack, reach(box))), known.range)
+    return AffineForm(known.slope, widen(known.offset, slip(observer.first.slack, reach(box))), known.range)
 
 
 def _free_map(observer: Observer) -> Any:
@@ -380,7 +383,13 @@ def _psi_box(observer: Observer, u: Any) -> Any:
     """The same at a point, as a box."""
     if not rounding.outward():
         return lambda x: _point(_psi(observer, u)(x))
-    return lambda x: inclusion.natural(_psi(observer, u))(_point(x))
+
+    def box(x: Any) -> Interval:
+        g = _value(observer.system.measurement, x, u)
+        sides = (jnp.concatenate([g.lower, x]), jnp.concatenate([g.upper, x]))
+        return image(jnp.concatenate([observer.T2, -observer.C], axis=1), Interval.unchecked(*sides))
+
+    return box
 
 
 def _point(value: Any) -> Interval:

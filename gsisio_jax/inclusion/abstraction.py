@@ -94,4 +94,5 @@ class Abstraction(eqx.Module):
 def _minimum(slope: Any, lower: Any, upper: Any, offset: Any) -> Any:
     """Lower bound of A x + b on boxes (cells, n), A of shape (cells?, m, n)."""
     low, _ = products(slope, Interval.unchecked(lower, upper))
-    return rounding.sum_down(jnp.concatenate([low, jnp.broadcast_to(offset[..., None], (*low.shape[:-1], 1))], -1))
+    terms = jnp.concatenate([low, jnp.broadcast_to(offset[..., None], (*low.shape[:-1], 1))], -1)
+    return rounding.unbounded(rounding.sum_down(terms), -jnp.inf) if rounding.outward() else terms.sum(-1)

@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gsisio_jax.fusion import add_up
 from gsisio_jax.inclusion.interpreter import evaluate
 from gsisio_jax.inclusion.node import (
+    THIN,
     Domain,
     Form,
     Node,
@@ -20,6 +22,7 @@ from gsisio_jax.inclusion.node import (
     guard,
     is_known,
     is_node,
+    is_point,
     jac_of,
     product,
     shift,
@@ -80,7 +83,13 @@ def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable
     @rounded_by("inclusion.natural", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("natural", box, args)
-        return _run(f, Node(box), args, _finish_range)
+        if not is_point(box):
+            return _run(f, Node(box), args, _finish_range)
+        token = THIN.set(True)
+        try:
+            return _run(f, _variable(box), args, _finish_range)
+        finally:
+            THIN.reset(token)
 
     return bounds
 
@@ -229,7 +238,7 @@ def _finish_affine(node: Node, box: Interval) -> AffineForm:
     bounds = guard(node.range)
     if is_known(slope):
         return AffineForm(jnp.asarray(np.moveaxis(slope, 0, -1)), jax.tree.map(jnp.asarray, offset), bounds)
-    good = jnp.isfinite(jnp.abs(slope).sum(0))
+    good = jnp.isfinite(add_up(jnp.abs(slope), 0))
     return AffineForm(jnp.moveaxis(jnp.where(good, slope, 0), 0, -1), choose(good, offset, bounds), bounds)
 
 

@@ -25,6 +25,7 @@ from gsisio_jax.inclusion.node import (
     parts,
     product,
     scaled_slack,
+    settled,
     shift,
     slope_of,
     stretch,
@@ -41,6 +42,7 @@ def multiply(x: Any, y: Any) -> Node:
         return multiple(x, y)
     if not is_node(y):
         return multiple(y, x)
+    x, y = settled(x), settled(y)
     natural = product(x.range, y.range)
     box, _ = parts([x, y])
     form = None
@@ -123,6 +125,7 @@ def raise_to(x: Any, p: Any) -> Node:
     if not is_node(p) and is_concrete(p) and np.size(p) > 0 and (np.asarray(p) == np.ravel(p)[0]).all():
         return integer_power(x, float(np.ravel(p)[0]))
     log, exp = CURVES["log"], CURVES["exp"]
+    x, p = settled(x), settled(p)
     if not is_node(x):
         good = jnp.asarray(x) > 0
         base = as_node(jnp.where(good, x, 1), p.shape, p.dtype)
@@ -198,7 +201,7 @@ def angle(y: Any, x: Any) -> Node:
     taken off: its extremes lie on the edges of the rectangle, where they are known in closed form.
     """
     shape, dtype = (y.shape, y.dtype) if is_node(y) else (x.shape, x.dtype)
-    y, x = (v if is_node(v) else as_node(v, shape, dtype) for v in (y, x))
+    y, x = (settled(v) if is_node(v) else as_node(v, shape, dtype) for v in (y, x))
     yl, yu, xl, xu = y.range.lower, y.range.upper, x.range.lower, x.range.upper
     cut = (xl < 0) & (yl < 0) & (yu >= 0)
     corners = extremes([_angle_at(b, a) for a in (xl, xu) for b in (yl, yu)])

@@ -28,6 +28,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.fusion import once
+
 LIMIT = {"float64": 1.6e6, "float32": 8.0e3, "float16": 1.0, "bfloat16": 1.0}
 """Arguments at or beyond this are not reduced: bounds are those of the whole period there."""
 
@@ -57,13 +59,13 @@ def sin_cos(t: Any) -> tuple[Any, Any]:
     for i in range(count, 0, -1):
         s, c = kind((-1) ** i / math.factorial(2 * i + 1)), kind((-1) ** (i + 1) / math.factorial(2 * i + 2))
         p, q = (s, c) if p is None else (s + z * p, c + z * q)
-    sine = y + y * (z * p)
-    cosine = 1 + z * (kind(-0.5) + z * q)
+    sine, cosine = once(y + y * (z * p)), once(1 + z * (kind(-0.5) + z * q))
     # k mod 4 in floating point: k is small.
     quarter = k - 4 * jnp.floor(k * kind(0.25))
     odd = (quarter == 1) | (quarter == 3)
     first, second = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)
-    return jnp.where(quarter >= 2, -first, first), jnp.where((quarter == 1) | (quarter == 2), -second, second)
+    sine, cosine = jnp.where(quarter >= 2, -first, first), jnp.where((quarter == 1) | (quarter == 2), -second, second)
+    return once(sine), once(cosine)
 
 
 @sin_cos.defjvp

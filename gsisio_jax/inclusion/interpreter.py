@@ -22,6 +22,7 @@ from jax.core import Tracer
 from gsisio_jax import rounding
 from gsisio_jax.inclusion import linear, logic
 from gsisio_jax.inclusion.node import (
+    THIN,
     Form,
     Node,
     as_node,
@@ -34,6 +35,7 @@ from gsisio_jax.inclusion.node import (
     known_if_concrete,
     parts,
     settle,
+    settled,
     slope_of,
 )
 from gsisio_jax.inclusion.table import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
@@ -71,7 +73,7 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
         return _call(eqn, *args) if CALLS.get(name) is _call else _constant(eqn, args)
     by_hand = _BY_HAND.get(name) or _BY_HAND.get(eqn.params.get("name"))
     if by_hand is not None:
-        value = settle(_apply_by_hand(by_hand, args))
+        value = settle(_apply_by_hand(by_hand, [settled(arg) for arg in args]))
         return [value] if eqn.primitive.multiple_results else value
     if name in CALLS:
         return CALLS[name](eqn, *args)
@@ -80,7 +82,7 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
     if name in REDUCTIONS or name in ELEMENTWISE:
         aligned = args if name in REDUCTIONS else _aligned(args, eqn.outvars[0].aval.shape)
         value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
-        return settle(value) if is_node(value) else value
+        return settle(value) if is_node(value) and not value.raw else value
     raise UnknownPrimitiveError(name)
 
 
@@ -184,7 +186,9 @@ def _loop(turn: Callable[..., Any], carry: list[Any], xs: Sequence[Any], length:
         """Entries of the scanned axis first, also in slopes and Jacobians."""
         if not is_node(x):
             return x
-        form = None if x.form is None else (jnp.swapaxes(x.form.slope, 0, 1), x.form.folded())
+        x = settled(x)
+        form = _form(x)
+        form = None if form is None else (jnp.swapaxes(form.slope, 0, 1), form.folded())
         return x.range, form, jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), x.jac)
 
     def inward(x: Any) -> Any:
@@ -217,7 +221,14 @@ def _bare(value: Any) -> Any:
     """A node without the box, which is the same in every turn."""
     if not is_node(value):
         return value
-    return value.range, None if value.form is None else (value.form.slope, value.form.folded()), value.jac
+    value = settled(value)
+    form = _form(value)
+    return value.range, None if form is None else (form.slope, form.folded()), value.jac
+
+
+def _form(node: Node) -> Form | None:
+    """The form of a node; none where only ranges were asked for."""
+    return None if THIN.get() else node.form
 
 
 def _unstack(form: Any, jac: Any, box: Any) -> tuple[Any, Any]:

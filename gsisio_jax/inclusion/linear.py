@@ -16,6 +16,7 @@ import numpy as np
 
 from gsisio_jax import rounding
 from gsisio_jax.inclusion.node import (
+    THIN,
     Form,
     Node,
     added_slack,
@@ -32,11 +33,13 @@ from gsisio_jax.inclusion.node import (
     parts,
     product,
     scaled_slack,
+    settled,
     shift,
     slack_of,
     slope_of,
     stretch,
     sum_slack,
+    unsettled,
 )
 from gsisio_jax.interval import Interval, is_concrete
 
@@ -51,7 +54,11 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
     dtype = next(v.dtype for v in values if is_node(v))
     nodes = [v if is_node(v) else as_node(v, jnp.shape(v), dtype) for v in values]
     box, jac = parts(nodes)
-    run = fold if all(is_concrete(v) for v in fixed) else _call
+    known = all(is_concrete(v) for v in fixed)
+    run = fold if known else _call
+    # Of linear functions: the form says all, and its image is the range.
+    linear = known and any(v.form is not None for v in nodes) and all(v.is_told for v in nodes)
+    box = next(v.form.box for v in nodes if v.form is not None) if linear else box
     adds = terms > 1 and rounding.outward()
 
     def as_list(result: Any) -> list[Any]:
@@ -78,9 +85,8 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
         return [Interval.unchecked(a, b) for a, b in zip(as_list(lower), as_list(upper), strict=True)]
 
     along = jax.vmap(fn)
-    ranges = both([v.range for v in nodes], fn)
+    ranges: list[Any] = [] if linear else both([v.range for v in nodes], fn)
     forms: list[Any] = [None] * len(ranges)
-    jacs: list[Any] = [None] * len(ranges)
     if box is not None:
         given = [slope_of(v, box) for v in nodes]
         slopes = as_list(run(along, *given))
@@ -91,9 +97,12 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
         if adds:
             slacks[0] = sum_slack(slacks[0], _lost(run, along, given, terms))
         forms = [Form(s, o, box, e) for s, o, e in zip(slopes, offsets, slacks, strict=True)]
+    ranges = ranges or [None] * len(forms)
+    jacs: list[Any] = [None] * len(forms)
     if jac is not None:
         jacs = both([jac_of(v, jac.lower.shape[0]) for v in nodes], along)
-    return [Node(*triple) for triple in zip(ranges, forms, jacs, strict=True)]
+    raw = rounding.outward() and (adds or any(v.raw for v in nodes))
+    return [Node(*triple, raw) for triple in zip(ranges, forms, jacs, strict=True)]
 
 
 def is_zeros(values: Sequence[Any]) -> bool:
@@ -124,14 +133,20 @@ def multiple(factor: Any, x: Node, rounded: bool = False) -> Node:
     if is_known(factor) and ((factor != 0) & (np.abs(factor) < np.finfo(x.dtype).tiny)).any():
         # Compiled code would take it for zero: a thin box, without form.
         thin = as_node(factor, np.broadcast_shapes(np.shape(factor), x.shape), x.dtype).range
+        x = settled(x)
         return Node(product(thin, x.range), None, None if x.jac is None else product(thin, x.jac))
     ulps = 4.0 if rounded else 2.0
+    if not (is_known(factor) and np.isfinite(factor).all()):
+        x = settled(x)  # 0 times NaN would count as 0
     form = x.form
     if form is not None:
         slope = factor * form.slope
         slack = scaled_slack(factor, form.slope, slope, form.slack, ulps)
         form = Form(slope, stretch(factor, form.offset, ulps), form.box, slack)
-    return Node(stretch(factor, x.range, ulps), form, None if x.jac is None else stretch(factor, x.jac, ulps))
+        if form.is_told():
+            return unsettled(None, form, None if x.jac is None else stretch(factor, x.jac, ulps))
+        form = None if THIN.get() else form
+    return unsettled(stretch(factor, x.range, ulps), form, None if x.jac is None else stretch(factor, x.jac, ulps))
 
 
 def negative(x: Node) -> Node:
@@ -140,7 +155,7 @@ def negative(x: Node) -> Node:
         return Interval.unchecked(lower, lower if is_point(a) else -a.lower)
 
     form = None if x.form is None else Form(-x.form.slope, flip(x.form.offset), x.form.box, x.form.slack)
-    return Node(flip(x.range), form, None if x.jac is None else flip(x.jac))
+    return Node(None if x.given is None else flip(x.given), form, None if x.jac is None else flip(x.jac), x.raw)
 
 
 def add(x: Any, y: Any) -> Node:
@@ -149,17 +164,34 @@ def add(x: Any, y: Any) -> Node:
         x, y = y, x
     if not is_node(y):
         y = as_node(y, np.broadcast_shapes(x.shape, np.shape(y)), x.dtype)
-    form = x.form if y.form is None else y.form
+    form, jac = x.form if y.form is None else y.form, join(x.jac, y.jac)
+    if form is not None and x.is_told and y.is_told:
+        return _known_sum(x, y, form.box, jac)
     total = shift(x.range, y.range)
-    if form is None:
-        return Node(total, None, join(x.jac, y.jac))
+    if form is None or THIN.get():
+        return unsettled(total, None, jac)
     offset = shift(x.offset, y.offset)
     if x.form is None or y.form is None:
         # With one form only there is nothing to cancel, and the range is what it was, moved.
-        return Node(total, Form(form.slope, offset, form.box, form.slack), join(x.jac, y.jac))
+        return unsettled(total, Form(form.slope, offset, form.box, form.slack), jac)
     slope = x.form.slope + y.form.slope
     slack = sum_slack(x.form.slack, y.form.slack, added_slack(x.form.slope, y.form.slope, slope))
-    return meet(Node(total, Form(slope, offset, form.box, slack), join(x.jac, y.jac)))
+    return meet(unsettled(total, Form(slope, offset, form.box, slack), jac))
+
+
+def _known_sum(x: Node, y: Node, box: Any, jac: Any) -> Node:
+    """Sum of linear functions."""
+    a, b = (slope_of(v, box) for v in (x, y))
+    slope = a + b
+    slack = sum_slack(*(v.form.slack for v in (x, y) if v.form is not None), added_slack(a, b, slope))
+    offset = shift(
+        *(Interval.unchecked(*(np.broadcast_to(side, slope.shape[1:]) for side in _sides(v.offset))) for v in (x, y))
+    )
+    return unsettled(None, Form(slope, offset, box, slack), jac)
+
+
+def _sides(a: Interval) -> tuple[Any, Any]:
+    return a.lower, a.upper
 
 
 def subtract(x: Any, y: Any) -> Node:

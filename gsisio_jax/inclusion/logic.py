@@ -17,6 +17,7 @@ from gsisio_jax.inclusion.bilinear import divide, multiply, pick
 from gsisio_jax.inclusion.curves import RELU, SOFTPLUS
 from gsisio_jax.inclusion.linear import add, negative, structural, subtract
 from gsisio_jax.inclusion.node import (
+    THIN,
     Form,
     Node,
     as_node,
@@ -27,6 +28,7 @@ from gsisio_jax.inclusion.node import (
     join,
     meet,
     parts,
+    settled,
     shift,
     slack_of,
     slope_image,
@@ -55,13 +57,13 @@ def compare(certain: Callable[[Any, Any], Any], possible: Callable[[Any, Any], A
     def rule(x: Any, y: Any) -> Node:
         shape = jnp.broadcast_shapes(jnp.shape(_low(x)), jnp.shape(_low(y)))
         dtype = x.dtype if is_node(x) else y.dtype
-        nodes = [v if is_node(v) else as_node(v, shape, dtype) for v in (x, y)]
+        nodes = [settled(v) if is_node(v) else as_node(v, shape, dtype) for v in (x, y)]
         a, b = nodes[0].range, nodes[1].range
         if a.lower.dtype == bool:
             return step(Interval.unchecked(certain(a.upper, b.lower), possible(a.lower, b.upper)), [x, y])
         sure, maybe = certain(a.upper, b.lower), possible(a.lower, b.upper)
         if all(v.form is not None for v in nodes):
-            gap = subtract(*nodes).range
+            gap = settled(subtract(*nodes)).range
             sure |= certain(gap.upper, jnp.zeros_like(gap.upper))
             maybe &= possible(gap.lower, jnp.zeros_like(gap.lower))
         return step(Interval.unchecked(sure, sure | maybe), [x, y])
@@ -115,9 +117,10 @@ def staircase(fn: Callable[[Any], Any], below: float, above: float) -> Callable[
     """Rule for rounding: ``fn`` is nondecreasing and ``fn(t) - t`` lies in ``[below, above]``."""
 
     def rule(x: Node) -> Node:
+        x = settled(x)
         natural = Interval.unchecked(fn(x.range.lower), fn(x.range.upper))
         node = step(natural, [x])
-        if x.form is None:
+        if x.form is None or THIN.get():
             return node
         before = x.form.offset
         offset = Interval.unchecked(rounding.down(before.lower + below), rounding.up(before.upper + above))
@@ -137,8 +140,9 @@ def sign(x: Node) -> Node:
 def _remainder(rounding: Callable[[Any], Any], x: Any, y: Any) -> Node:
     """``x - y k`` with k the rounded quotient; linear where k is one number on the whole box."""
     shape, dtype = (x.shape, x.dtype) if is_node(x) else (y.shape, y.dtype)
+    x, y = settled(x), settled(y)
     a, b = (v.range if is_node(v) else as_node(v, shape, dtype).range for v in (x, y))
-    quotient = divide(x, y).range
+    quotient = settled(divide(x, y)).range
     low, high = rounding(quotient.lower), rounding(quotient.upper)
     known = (low == high) & jnp.isfinite(low)
     count = jnp.where(known, low, 0)
@@ -166,7 +170,7 @@ def log_add_exp(x: Any, y: Any) -> Node:
     """``log(exp x + exp y)``: smooth, so without the kink of the maximum that its body starts from."""
     if not is_node(x):
         x, y = y, x
-    y = y if is_node(y) else as_node(y, x.shape, x.dtype)
+    x, y = settled(x), settled(y) if is_node(y) else as_node(y, x.shape, x.dtype)
     low, high = x.range.lower, x.range.upper
     first, last = _log_add_exp(low, y.range.lower), _log_add_exp(high, y.range.upper)
     # max(x, y) + log1p(exp(-|x - y|)): the sum may cancel, so its error goes with the two terms.
@@ -178,7 +182,7 @@ def log_add_exp(x: Any, y: Any) -> Node:
     total = add(bend, Node(y.range, y.form))
     form = total.form
     form = form and best_form(form.slope, form.offset, natural, form.box, form.slack)
-    gap = subtract(Node(x.range, x.form), Node(y.range, y.form)).range
+    gap = settled(subtract(Node(x.range, x.form), Node(y.range, y.form))).range
     share = SOFTPLUS.derivative(gap.lower, gap.upper)
     rest = Interval.unchecked(
         jnp.maximum(rounding.lowered(1 - share.upper, jnp.ones_like(share.upper), 2.0), 0),
@@ -199,10 +203,11 @@ def maximum(x: Any, y: Any) -> Node:
         x, y = y, x
     if not is_node(y):
         y = as_node(y, x.shape, x.dtype)
+    x, y = settled(x), settled(y)
     a, b = x.range, y.range
     natural = Interval.unchecked(jnp.maximum(a.lower, b.lower), jnp.maximum(a.upper, b.upper))
     box, jac = parts([x, y])
-    gap = subtract(Node(x.range, x.form), Node(y.range, y.form))
+    gap = settled(subtract(Node(x.range, x.form), Node(y.range, y.form)))
     first, second = gap.range.lower >= 0, gap.range.upper <= 0
     form = None
     if box is not None:
@@ -247,7 +252,7 @@ def select(which: Any, *cases: Any) -> Any:
         single = [(low == i) & (high == i) for i in range(len(cases))]
     shape = next((v.shape for v in cases if is_node(v)), jnp.shape(cases[0]))
     typed = jnp.result_type(*([v.dtype for v in cases if is_node(v)] or cases))
-    nodes = [v if is_node(v) else as_node(v, shape, typed) for v in cases]
+    nodes = [settled(v) if is_node(v) else as_node(v, shape, typed) for v in cases]
     if nodes[0].range.lower.dtype == bool:
         lower = jnp.stack([~p | v.range.lower for p, v in zip(possible, nodes, strict=True)]).all(0)
         upper = jnp.stack([p & v.range.upper for p, v in zip(possible, nodes, strict=True)]).any(0)

@@ -17,6 +17,7 @@ exact: then the form of such a function on an infinite box stays what it is.
 
 from __future__ import annotations
 
+from contextvars import ContextVar
 from typing import Any
 
 import equinox as eqx
@@ -26,9 +27,13 @@ import numpy as np
 from jax.core import Tracer
 
 from gsisio_jax import rounding
-from gsisio_jax.interval import Interval, choose, reach
+from gsisio_jax.fusion import add_up, once
+from gsisio_jax.interval import Interval, choose, held, reach
 from gsisio_jax.ties import larger, smaller
 
+# The box is a point and only ranges are asked for: forms are kept for linear functions alone, whose value at the point
+# they give with a single widening.
+THIN: ContextVar[bool] = ContextVar("gsisio_jax_thin", default=False)
 _LOSS = 64.0  # in best_form: narrower by less than this many ulps is narrower by rounding
 
 
@@ -61,7 +66,7 @@ class Domain(eqx.Module):
 
     @classmethod
     def of(cls, box: Interval) -> Domain:
-        return cls(box.lower, box.upper, reach(box))
+        return cls(box.lower, box.upper, abs(box.lower) if is_point(box) else reach(box))
 
 
 class Form(eqx.Module):
@@ -83,32 +88,112 @@ class Form(eqx.Module):
 
     def image(self) -> Interval:
         """Bounds of the value that follow from the form alone."""
+        if self.is_told():
+            return self._known_image()
         low, high = slope_products(self.slope, self.box)
-        lower, upper = low.sum(0) + self.offset.lower, high.sum(0) + self.offset.upper
+        lower, upper = add_up(low, 0) + self.offset.lower, add_up(high, 0) + self.offset.upper
         if not rounding.outward():
             return Interval.unchecked(lower, upper)
         n = low.shape[0] + 6.0
         # The slack counts whole; its own rounding is far below what it was taken too large by.
         loss = 0 if self.slack is None else slope_reach(self.slack, self.box)
-        lower = lower - (loss + rounding.error(abs(low).sum(0) + abs(self.offset.lower) + loss, n, n))
-        upper = upper + (loss + rounding.error(abs(high).sum(0) + abs(self.offset.upper) + loss, n, n))
+        lower = lower - (loss + rounding.error(add_up(abs(low), 0) + abs(self.offset.lower) + loss, n, n))
+        upper = upper + (loss + rounding.error(add_up(abs(high), 0) + abs(self.offset.upper) + loss, n, n))
         return Interval.unchecked(lower, upper)
+
+    def is_told(self) -> bool:
+        """All numbers but those of the box are known while tracing: the function is linear."""
+        return _finite_numbers(self.slope, self.offset.lower, self.offset.upper) and (
+            self.slack is None or _finite_numbers(self.slack)
+        )
+
+    def _known_image(self) -> Interval:
+        """`image` where signs and zeros are known: rows that round nothing are not widened."""
+        slope, offset = self.slope, self.offset
+        used = [j for j in range(len(slope)) if slope[j].any()]
+        count = (slope != 0).sum(0)
+        plain = np.ones(slope.shape[1:], bool)
+        for j in used:
+            plain &= is_exact(slope[j], each=True)
+        exact = (count == 0) | ((count == 1) & plain & (offset.lower == 0) & (offset.upper == 0))
+        if self.slack is not None:
+            exact &= ~self.slack.any(0)
+        outward = rounding.outward() and not exact.all()
+        sides: list[Any] = []
+        same = self.box.lower is self.box.upper and is_point(offset)
+        for sign in (-1,) if same else (-1, 1):
+            start = offset.lower if sign < 0 else offset.upper
+            first, last = (self.box.lower, self.box.upper) if sign < 0 else (self.box.upper, self.box.lower)
+            if slope[0].size == 1:
+                terms = [_known_times(slope[j], first[j], last[j]) for j in used]
+                total = sum(terms[1:], terms[0]) if terms else None
+                size = sum((abs(term) for term in terms[1:]), abs(terms[0])) if terms and outward else None
+            elif used:
+                spread = (-1,) + (1,) * (slope.ndim - 1)
+                many = _known_times(slope[used], *(jnp.reshape(side[np.array(used)], spread) for side in (first, last)))
+                total, size = add_up(many, 0), add_up(abs(many), 0) if outward else None
+            else:
+                total = size = None
+            if start.any():
+                total, size = (start, abs(start)) if total is None else (total + start, outward and size + abs(start))
+            sides.append((np.broadcast_to(start, slope.shape[1:]) if total is None else total, size))
+        (lower, low_size), (upper, high_size) = sides[0], sides[-1]
+        if not outward:
+            return Interval.unchecked(lower, upper)
+        n = len(used) + 6.0
+        info = np.finfo(slope.dtype)
+        share, floor = (np.where(exact, 0, value).astype(slope.dtype) for value in (n * info.eps, n * info.tiny))
+        if self.slack is not None and self.slack.any():
+            low_size, high_size = (
+                size + slope_reach(self.slack / share.max(), self.box) for size in (low_size, high_size)
+            )
+        radius = jax.lax.stop_gradient(_spare(exact, low_size * share) + floor)
+        other = radius if same else jax.lax.stop_gradient(_spare(exact, high_size * share) + floor)
+        return Interval.unchecked(lower - radius, upper + other)
 
 
 class Node(eqx.Module):
-    """A value that is not constant: range, and optionally an affine form and a Jacobian enclosure (n, *shape)."""
+    """A value that is not constant: range, and optionally an affine form and a Jacobian enclosure (n, *shape).
 
-    range: Interval
+    The range of a linear function (`Form.is_told`) need not be given: no other one is better than the image of its
+    form, which is computed when it is asked for.
+
+    Sums hand a NaN on, so it need not be looked for after each of them: `raw` nodes may hold one where they overflowed,
+    until `settle` turns it into "no bound". Every rule that compares its arguments settles them first.
+    """
+
+    given: Interval | None
     form: Form | None = None
     jac: Interval | None = None
+    raw: bool = eqx.field(static=True, default=False)
+
+    @property
+    def range(self) -> Interval:
+        if self.given is None:
+            assert self.form is not None
+            image = guard(self.form.image())
+            object.__setattr__(self, "given", image if is_known(image.lower) else held(image))
+        assert self.given is not None
+        return self.given
 
     @property
     def shape(self) -> tuple[int, ...]:
+        if self.given is None and self.form is not None:
+            return self.form.slope.shape[1:]
         return self.range.lower.shape
 
     @property
     def dtype(self) -> Any:
+        if self.given is None and self.form is not None:
+            return self.form.slope.dtype
         return self.range.lower.dtype
+
+    @property
+    def is_told(self) -> bool:
+        """A linear function or a constant, with known numbers."""
+        if self.form is None:
+            return self.given is not None and _finite_numbers(self.given.lower, self.given.upper)
+        return self.form.is_told()
 
     @property
     def offset(self) -> Interval:
@@ -213,10 +298,28 @@ def _known_multiple(factor: Any, a: Interval) -> Interval:
     return Interval.unchecked(np.minimum(lower, other[0]), np.maximum(upper, other[1]))
 
 
-def is_exact(factor: Any) -> bool:
+def is_exact(factor: Any, each: bool = False) -> Any:
     """Powers of two (or 0) of magnitude one at least: a product with them rounds nothing, and nothing is flushed."""
     size = np.abs(factor)
-    return bool(((size == 0) | ((np.frexp(size)[0] == 0.5) & (size >= 1))).all())
+    found = (size == 0) | ((np.frexp(size)[0] == 0.5) & (size >= 1))
+    return found if each else bool(found.all())
+
+
+def _finite_numbers(*values: Any) -> bool:
+    return all(is_known(value) and value.dtype != bool and np.isfinite(value).all() for value in values)
+
+
+def _known_times(factor: Any, first: Any, last: Any) -> Any:
+    """``factor`` times `first` where it is positive, times `last` where it is negative, and 0 where it is 0."""
+    up = factor >= 0
+    value = first if up.all() else last if not up.any() else jnp.where(up, first, last)
+    product = jnp.broadcast_to(value, factor.shape) if (factor == 1).all() else factor * value
+    return jnp.where(factor == 0, 0, product) if (factor == 0).any() else product
+
+
+def _spare(exact: Any, radius: Any) -> Any:
+    """Nothing for exact rows, even where they are infinite."""
+    return jnp.where(exact, 0, radius) if exact.any() else radius
 
 
 def product(a: Interval, b: Interval) -> Interval:
@@ -250,7 +353,7 @@ def slope_reach(slope: Any, box: Domain) -> Any:
         terms = jnp.where(size == 0, 0, size * far) if (size == 0).any() else size * far
     else:
         terms = jnp.where(size == 0, 0, size * far)
-    return jax.lax.stop_gradient(terms).sum(0)
+    return add_up(jax.lax.stop_gradient(terms), 0)
 
 
 def loosened(a: Interval, radius: Any, ulps: float = 2.0) -> Interval:
@@ -311,11 +414,11 @@ def guard(a: Interval) -> Interval:
 
 def meet(node: Node) -> Node:
     """Intersect the range with what the form says; where rounding makes the two miss each other, keep the range."""
-    if node.form is None:
+    if node.form is None or node.given is None:
         return node
     natural, image = node.range, node.form.image()
     lower, upper = larger(natural.lower, image.lower), smaller(natural.upper, image.upper)
-    return Node(choose(lower <= upper, Interval.unchecked(lower, upper), natural), node.form, node.jac)
+    return Node(held(choose(lower <= upper, Interval.unchecked(lower, upper), natural)), node.form, node.jac, node.raw)
 
 
 def best_form(slope: Any, offset: Interval, natural: Interval, box: Domain, slack: Any = None, size: Any = 0) -> Form:
@@ -330,13 +433,25 @@ def best_form(slope: Any, offset: Interval, natural: Interval, box: Domain, slac
     loss = _LOSS * jnp.finfo(width.dtype).eps * jax.lax.stop_gradient(size)
     good = jnp.isfinite(width) & (width - loss <= natural.upper - natural.lower)
     slack = None if slack is None else jnp.where(good, slack, 0)
-    return Form(jnp.where(good, slope, 0), choose(good, offset, natural), box, slack)
+    return Form(once(jnp.where(good, slope, 0)), held(choose(good, offset, natural)), box, slack)
+
+
+def unsettled(given: Interval | None, form: Form | None, jac: Interval | None) -> Node:
+    """A node that a linear rule made; to nearest it is settled at once."""
+    return Node(given, form, jac, rounding.outward())
+
+
+def settled(value: Any) -> Any:
+    """`settle` where that has not been done."""
+    return settle(value) if is_node(value) and value.raw else value
 
 
 def settle(node: Node) -> Node:
     """Last word on the result of every arithmetic rule, in all three domains: what overflowed is unbounded."""
     if not jnp.issubdtype(node.dtype, jnp.floating):
         return node
+    if node.given is None:
+        return node if node.jac is None else Node(None, node.form, guard(node.jac))
     form, jac = node.form, node.jac
     if form is not None:
         form = Form(form.slope, guard(form.offset), form.box, form.slack)
@@ -363,7 +478,7 @@ def parts(values: Any) -> tuple[Any, Any]:
     box, jac = None, None
     for value in values:
         if is_node(value):
-            box = value.form.box if box is None and value.form is not None else box
+            box = value.form.box if box is None and value.form is not None and not THIN.get() else box
             jac = value.jac if jac is None else jac
     return box, jac
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion import bilinear, curves, linear, logic, univariate
-from gsisio_jax.inclusion.node import Node, is_node
+from gsisio_jax.inclusion.node import Node, is_node, settled
 from gsisio_jax.interval import Interval
 
 
@@ -99,6 +99,7 @@ def _convert(eqn: Any, x: Node) -> Node:
     if jnp.issubdtype(target, jnp.floating):
         if jnp.issubdtype(x.dtype, jnp.floating) and jnp.finfo(target).bits < jnp.finfo(x.dtype).bits:
             # Bounds are those of the number before it is rounded to the narrower type, as for every other operation.
+            x = settled(x)
             narrow = x.range.astype(target)
             jac = None if x.jac is None else x.jac.astype(target)
             return Node(narrow, None, jac)

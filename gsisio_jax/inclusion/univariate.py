@@ -31,10 +31,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import rounding
+from gsisio_jax.fusion import once
 from gsisio_jax.inclusion.elementary import LIMIT
-from gsisio_jax.inclusion.node import Node, best_form, guard, product, scaled_slack, slope_reach, times
+from gsisio_jax.inclusion.node import THIN, Node, best_form, guard, product, scaled_slack, settled, slope_reach, times
 from gsisio_jax.inclusion.waves import Wave, crosses
-from gsisio_jax.interval import Interval, choose, entire_like
+from gsisio_jax.interval import Interval, choose, entire_like, held
 from gsisio_jax.ties import larger, smaller
 
 INF = math.inf
@@ -45,13 +46,17 @@ _PLAIN = (-1.0, 0.0, 0.25, 1.0, 2.0)  # limits of functions that are numbers of 
 
 def apply(curve: Any, x: Node) -> Node:
     """Apply a function of one variable to a node, in all domains."""
+    x = settled(x)
     a, b = x.range.lower, x.range.upper
+    if isinstance(curve, Wave) and THIN.get():
+        return Node(held(curve.near(a, b)))
     # What range, line and derivative of a wave have in common is computed once.
     shared = (curve.parts(a, b),) if isinstance(curve, Wave) else ()
-    natural = guard(curve.range(a, b, *shared))
+    natural = held(guard(curve.range(a, b, *shared)))
     form = None
-    if x.form is not None:
+    if x.form is not None and not THIN.get():
         s, rest = curve.line(a, b, natural, *shared)
+        s, rest = once(s), held(rest)
         slope, offset = s * x.form.slope, x.form.offset
         up = s >= 0
         first, last = (times(s, jnp.where(mask, offset.lower, offset.upper)) for mask in (up, ~up))
@@ -61,7 +66,7 @@ def apply(curve: Any, x: Node) -> Node:
             upper = rounding.raised(upper, abs(last) + abs(upper), 2.0)
             slack = scaled_slack(s, x.form.slope, slope, x.form.slack)
             size = slope_reach(slope, x.form.box)
-        form = best_form(slope, Interval.unchecked(lower, upper), natural, x.form.box, slack, size)
+        form = best_form(slope, held(Interval.unchecked(lower, upper)), natural, x.form.box, slack, size)
     jac = None if x.jac is None else product(guard(curve.derivative(a, b, *shared)), x.jac)
     return Node(natural, form, jac)
 

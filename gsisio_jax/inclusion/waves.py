@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import rounding
+from gsisio_jax.fusion import once
 from gsisio_jax.inclusion.elementary import LIMIT, SLOT, sin_cos
 from gsisio_jax.interval import Interval, choose
 from gsisio_jax.ties import larger, smaller
@@ -49,6 +50,15 @@ class Wave:
     def range(self, a: Any, b: Any, parts: _WaveParts | None = None) -> Interval:
         return _wave_range(self.cosine, 1.0, parts or self.parts(a, b))
 
+    def near(self, a: Any, b: Any) -> Interval:
+        """Bounds that are as good as `range` on thin boxes: no value is farther from that in the middle than r."""
+        usable, m, r = _middle(a, b)
+        value, radius = sin_cos(m)[self.cosine], r
+        if rounding.outward():
+            radius = r + rounding.error(abs(m) + r + (1.0 if self.cosine else 0.0), 8 * SLOT)
+        radius = jnp.where(usable, radius, 2)
+        return Interval.unchecked(larger(value - radius, -1), smaller(value + radius, 1))
+
     def derivative(self, a: Any, b: Any, parts: _WaveParts | None = None) -> Interval:
         return _wave_range(not self.cosine, -1.0 if self.cosine else 1.0, parts or self.parts(a, b))
 
@@ -68,9 +78,9 @@ class Wave:
 
 def _middle(a: Any, b: Any) -> tuple[Any, Any, Any]:
     """Is [a, b] within less than a period and near enough for `sin_cos`; middle and half-width, 0 where it is not."""
-    usable = (b - a < _PERIOD) & (abs(a) < LIMIT[a.dtype.name]) & (abs(b) < LIMIT[a.dtype.name])
-    a, b = jnp.where(usable, a, 0), jnp.where(usable, b, 0)
-    return usable, 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
+    m, r = 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
+    usable = (r < 0.5 * _PERIOD) & (abs(m) + r < LIMIT[a.dtype.name])  # not where either is infinite or NaN
+    return usable, once(jnp.where(usable, m, 0)), once(jnp.where(usable, r, 0))
 
 
 def _wave_padded(exact: Interval, cosine: bool, m: Any, r: Any) -> Interval:
