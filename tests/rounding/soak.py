@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from typing import Any
 
@@ -37,6 +38,12 @@ assert set(SHARES) == {*LINEAR, *NONLINEAR, "quadratic"}
 assert QUADRATIC.squares
 
 
+def _tell(what: str, done: int, misses: int, examples: list[Any], started: float) -> None:
+    """Progress, for who waits."""
+    line = f"  {what}: {done:,}, {misses:,} misses, {time.perf_counter() - started:.0f} s"
+    print(line, *examples[:3], sep="\n    ", file=sys.stderr, flush=True)
+
+
 def primitives(dtype: Any, points: float, seed: int, rounding: Rounding = "outward") -> dict[str, Any]:
     """Every function in turn until so many (function, box, point) were looked at."""
     total, started, turns = Tally(), time.perf_counter(), 0
@@ -45,6 +52,7 @@ def primitives(dtype: Any, points: float, seed: int, rounding: Rounding = "outwa
         for name in FUNCTIONS:
             total.add(check(name, seed + turns, max(many // RARE.get(name, 1), 64), POINTS, dtype, rounding))
         turns += 1
+        _tell("primitives", total.points, total.misses, total.examples, started)
     closest = {name: float(f"{room:.3g}") for name, room in total.closest.items() if np.isfinite(room)}
     least = sorted((room, name) for name, room in closest.items() if room > 0)[:5]
     return {
@@ -76,6 +84,7 @@ def observers(dtype: Any, steps: float, seed: int, rounding: Rounding = "outward
             turn += 1
         estimator.cache_clear()
         total.add(part)
+        _tell(name, part.steps, part.misses + part.alarms, [], started)
         plants[name] = {
             "steps": part.steps,
             "runs": turn * batch,

@@ -15,8 +15,8 @@ from sampling import boxes, points
 
 NAMES = list(FUNCTIONS)
 DTYPES = [np.float64, np.float32]
-# Every function in one precision, in turn; the whole table in both is `test_soak`.
-SLICES = [(np.float64, NAMES[0::3]), (np.float32, NAMES[1::3])]
+# Every fourth function in one precision, every other fourth in the other; the whole table in both is `test_soak`.
+SLICES = [(np.float64, NAMES[0::4]), (np.float32, NAMES[2::4])]
 
 
 @pytest.mark.parametrize(("dtype", "names"), SLICES, ids=["float64", "float32"])
@@ -25,7 +25,7 @@ def test_no_value_lies_outside_of_its_bounds(dtype, names):
     for name in names:
         tally.add(check(name, 0, 512, 24, dtype))
     assert tally.misses == 0, tally.examples[:5]
-    assert tally.points > 200_000
+    assert tally.points > 150_000
     assert tally.skipped < tally.checks // 100
 
 
