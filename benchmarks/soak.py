@@ -104,7 +104,9 @@ def summary(found: dict[str, Any]) -> str:
         return f"FAILED {found['error']}"
     size = found.get("points") or found.get("steps") or found.get("sums")
     checks = found.get("checks", size)
-    return f"{size:,} looked at, {checks:,} numbers against their bounds, {found['misses']:,} misses, {found['seconds']} s"
+    return (
+        f"{size:,} looked at, {checks:,} numbers against their bounds, {found['misses']:,} misses, {found['seconds']} s"
+    )
 
 
 def table(record: dict[str, Any]) -> str:

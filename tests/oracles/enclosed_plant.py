@@ -41,7 +41,7 @@ def enclosed_records(
     rng: np.random.Generator, plant: Nonlinear, batch: int, steps: int, noise: Any, dtype: Any
 ) -> tuple[Record, np.ndarray]:
     """Runs of a plant, and its known inputs; `noise` is a number, or one for every run."""
-    n, p, l = len(plant.G), plant.G.shape[1], len(plant.H)
+    n, l = len(plant.G), len(plant.H)
     sizes = np.broadcast_to(np.asarray(noise, float), (batch,))[:, None]
     x, y = np.zeros((batch, steps, n), dtype), np.zeros((batch, steps, l), dtype)
     u, d = plant.u(steps).astype(dtype), plant.d(rng, (batch, steps)).astype(dtype)
@@ -57,15 +57,14 @@ def enclosed_records(
     now, given = ([I(side[..., i].astype(np.float64)) for i in range(side.shape[-1])] for side in (x, d))
     known = [I(np.broadcast_to(u[:, i].astype(np.float64), (batch, steps)).copy()) for i in range(u.shape[1])]
     seen, moved = plant.g(ival, now), plant.f(ival, now, known)
-    v = [
-        I(y[..., i].astype(np.float64)) - seen[i] - _image(plant.H_whole[i], given) / plant.H_over for i in range(l)
-    ]
+    v = [I(y[..., i].astype(np.float64)) - seen[i] - image(plant.H_whole[i], given) / plant.H_over for i in range(l)]
     following = np.concatenate([x[:, 1:], x[:, -1:]], 1).astype(np.float64)
-    w = [I(following[..., i]) - moved[i] - _image(plant.G[i], given) for i in range(n)]
+    w = [I(following[..., i]) - moved[i] - image(plant.G[i], given) for i in range(n)]
     return Record(x, y, d, _outward(w, dtype), _outward(v, dtype)), u
 
 
-def _image(row: Any, d: Any) -> Any:
+def image(row: Any, d: Any) -> Any:
+    """A row of floats times interval entries."""
     return sum((float(m) * t for m, t in zip(row, d, strict=True)), I(0.0))
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+
 def product(a: Any, b: Any) -> list[Any]:
     """Two arrays whose exact sum is ``a * b``."""
     p = a * b

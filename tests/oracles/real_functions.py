@@ -206,7 +206,10 @@ FUNCTIONS: dict[str, Real] = {
         lax.erfc, ival.erfc, lambda t: -2 * ival.rsqrt(PI) * _gauss(t), lambda t: t.erfc(),
         lambda t: -2 / arb.pi().sqrt() * (-t * t).exp(),
     ),
-    "abs": _one(jnp.abs, abs, lambda t: I(np.where(t.lo == 0, np.nan, np.sign(t.lo))), lambda t: abs(t), lambda t: arb(1 if t > 0 else -1)),
+    "abs": _one(
+        jnp.abs, abs, lambda t: I(np.where(t.lo == 0, np.nan, np.sign(t.lo))),
+        lambda t: abs(t), lambda t: arb(1 if t > 0 else -1),
+    ),
     "floor": _step(jnp.floor, np.floor, (2.0, -7.0, 1e6)),
     "ceil": _step(jnp.ceil, np.ceil),
     "round": _step(jnp.round, np.round),

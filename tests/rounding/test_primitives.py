@@ -15,8 +15,8 @@ from sampling import boxes, points
 
 NAMES = list(FUNCTIONS)
 DTYPES = [np.float64, np.float32]
-# Every fourth function in one precision, every other fourth in the other; the whole table in both is `test_soak`.
-SLICES = [(np.float64, NAMES[0::4]), (np.float32, NAMES[2::4])]
+# Every fifth function in one precision, another fifth in the other; the whole table in both is `test_soak`.
+SLICES = [(np.float64, NAMES[0::5]), (np.float32, NAMES[3::5])]
 
 
 @pytest.mark.parametrize(("dtype", "names"), SLICES, ids=["float64", "float32"])
@@ -25,7 +25,7 @@ def test_no_value_lies_outside_of_its_bounds(dtype, names):
     for name in names:
         tally.add(check(name, 0, 512, 24, dtype))
     assert tally.misses == 0, tally.examples[:5]
-    assert tally.points > 150_000
+    assert tally.points > 100_000
     assert tally.skipped < tally.checks // 100
 
 
@@ -36,13 +36,13 @@ def test_rounded_to_nearest_the_same_checks_fail(dtype):
         assert tally.misses > tally.checks // 100, name
 
 
-@pytest.mark.parametrize("name", ["over 103", "1 - cos", "x y - x"])
-def test_the_same_bounds_hold_eager_and_for_one_box(name):
+def test_the_same_bounds_hold_eager_and_for_one_box():
     """Compiled, operation by operation, and without a batch: XLA rearranges each of them in its own way."""
+    assert check("over 103", 1, 64, 24, np.float32, jit=False).misses == 0
+    name = "x y - x"
     real, rng = FUNCTIONS[name], np.random.default_rng(3)
-    lower, upper = boxes(rng, 6, np.float32, real)
+    lower, upper = boxes(rng, 3, np.float32, real)
     t = points(rng, lower, upper, 24, real)
-    assert check(name, 1, 64, 24, np.float32, jit=False).misses == 0
     for i in range(3):
         for jit in (True, False):
             found = bounds_of(name, "outward", jit, batched=False)(lower[i], upper[i])
