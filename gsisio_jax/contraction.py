@@ -230,7 +230,7 @@ def strips(evidence: Evidence, form: AffineForm, z: Interval) -> Evidence:
     free = add(z, Interval.unchecked(-offset.upper, -offset.lower))
     own = add(Interval.unchecked(free.lower[:, None], free.upper[:, None]), Interval.unchecked(-rest_high, -rest_low))
     usable = jnp.abs(slope) > _SMALLEST_SLOPE * jnp.max(jnp.abs(slope), axis=-1, keepdims=True)
-    inverse = jnp.where(usable, 1 / jnp.where(usable, slope, 1), 0)
+    inverse = once(jnp.where(usable, 1 / jnp.where(usable, slope, 1), 0))
     a, b = scale(inverse, own.lower), scale(inverse, own.upper)
     solved = Interval.unchecked(
         jnp.where(usable, rounding.down(smaller(a, b), 4.0), -jnp.inf),
@@ -264,8 +264,9 @@ def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box:
     difference = form.slope - C  # (q, n)
     small = jnp.eye(C.shape[0], dtype=difference.dtype) + _product(difference, N_z)
     inverse, defect, verified = _verified_inverse(small)
+    inverse = once(inverse)
     through = _product(inverse, difference)
-    correction = _product(N_z, through)  # N_z (I + (S-C) N_z)^-1 (S-C)
+    correction = once(_product(N_z, through))  # N_z (I + (S-C) N_z)^-1 (S-C)
     shifted = add(right, image(-N_z, form.offset))
     solved = image(jnp.eye(C.shape[1], dtype=difference.dtype) - correction, shifted)
     if rounding.outward():
@@ -344,7 +345,7 @@ def centred(
     c = _clip(middle, within)
     for _ in range(rounds):
         moved = (middle - _vector(N_z, remainder(c))).astype(middle.dtype)  # constants of g may have promoted it
-        c = _clip(moved, within)
+        c = once(_clip(moved, within))
     moved = add(Interval.unchecked(middle, middle), image(-N_z, bounded_remainder(c)))
     moved = Interval.unchecked(*(_clip(side, within) for side in (moved.lower, moved.upper)))
     move = rounding.up(larger(abs(moved.upper - c), abs(c - moved.lower)))

@@ -13,10 +13,23 @@ import jax.numpy as jnp
 
 from gsisio_jax import inclusion, rounding
 from gsisio_jax.contraction import Bank, Evidence, Slips, Terms, centred, magnitude, solve_remainder, strips
-from gsisio_jax.fusion import add_up
+from gsisio_jax.fusion import add_up, once
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.methods import bound
-from gsisio_jax.interval import Interval, add, choose, entire_like, image, intersect, mended, reach, slip, spread, widen
+from gsisio_jax.interval import (
+    Interval,
+    add,
+    choose,
+    entire_like,
+    held,
+    image,
+    intersect,
+    mended,
+    reach,
+    slip,
+    spread,
+    widen,
+)
 from gsisio_jax.observer import Carry, Observer, StepOutput
 from gsisio_jax.status import Source, Status, bit_mask
 from gsisio_jax.system import Noise, System
@@ -75,6 +88,7 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
     h = carry.h
     both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), gains.flat(), inverses.flat())
     bound = both.explicit(h, before, terms)[0]
+    bound = held(bound)
     right = Interval.unchecked(*(x[: gains.rows].reshape(-1, n) for x in (bound.lower, bound.upper)))
     shape = inverses.residual.shape[:2]
     d_fixed = Interval.unchecked(*(x[gains.rows :].reshape(shape) for x in (bound.lower, bound.upper)))
@@ -87,8 +101,8 @@ def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) ->
     evidence = alone = strips(evidence, form, z)
     missed = _Missed(observer, d_fixed)
     evidence = _meet_first_boxes(observer, evidence, right, missed, u)
-    right = widen(right, missed.of(observer.guard.gains, evidence.box))
-    d_fixed = widen(d_fixed, missed.of(observer.guard.inverses, evidence.box))
+    right = held(widen(right, missed.of(observer.guard.gains, evidence.box)))
+    d_fixed = held(widen(d_fixed, missed.of(observer.guard.inverses, evidence.box)))
     for sweep in range(observer.sweeps):
         if affine:
             form = _first_form(observer, evidence.box, u)
@@ -126,7 +140,7 @@ class _Missed:
 
     def input_reach(self, box: Interval) -> Any:
         """Bound of ``|d[k-1]|``, (p,), from a box of x[k]."""
-        return jnp.minimum(self.limit, self.inputs + slip(self.guard.input_state, reach(box)))
+        return once(jnp.minimum(self.limit, self.inputs + slip(self.guard.input_state, reach(box))))
 
     def of(self, slips: Slips, box: Interval) -> Any:
         """Radius (K, r) by which a bank's bounds are to be widened; None to nearest."""
