@@ -12,7 +12,7 @@ POINTS = 8  # fewest points of an interval: two ends, their neighbours, two that
 
 
 def boxes(rng: np.random.Generator, count: int, dtype: Any, real: Real) -> tuple[np.ndarray, np.ndarray]:
-    """`count` boxes in the domain of a function, every side of any kind; lower and upper ends (count, n)."""
+    """`count` boxes, most of them in the domain of a function, every side of any kind; both ends (count, n)."""
     sides = [_intervals(rng, count, dtype, real.domain if i == 0 else (-np.inf, np.inf)) for i in range(real.size)]
     return np.stack([side[0] for side in sides], 1), np.stack([side[1] for side in sides], 1)
 
@@ -38,7 +38,8 @@ def _intervals(rng: np.random.Generator, count: int, dtype: Any, domain: tuple[f
     mixed = np.where(rng.random(count) < 0.5, [middle, far[0]], [near[0], far[1]])
     found = [ends, thin, [point, point], far, near, below, half, both, across, mixed]
     pair = np.select([kind == i for i in range(len(KINDS))], [np.asarray(x) for x in found])
-    pair = np.sort(np.clip(pair, *domain), axis=0)
+    # One of ten reaches beyond the domain.
+    pair = np.sort(np.where(rng.random(count) < 0.1, pair, np.clip(pair, *domain)), axis=0)
     with np.errstate(over="ignore"):
         pair = pair.astype(dtype) + dtype(0)  # no negative zero
     pair[0] = np.where(pair[0] == np.inf, info.max, pair[0])

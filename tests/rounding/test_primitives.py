@@ -15,8 +15,8 @@ from sampling import boxes, points
 
 NAMES = list(FUNCTIONS)
 DTYPES = [np.float64, np.float32]
-# Every fifth function in one precision, another fifth in the other; the whole table in both is `test_soak`.
-SLICES = [(np.float64, NAMES[0::5]), (np.float32, NAMES[3::5])]
+# Every sixth function in one precision, another sixth in the other; the whole table in both is `test_soak`.
+SLICES = [(np.float64, NAMES[0::6]), (np.float32, NAMES[3::6])]
 
 
 @pytest.mark.parametrize(("dtype", "names"), SLICES, ids=["float64", "float32"])
@@ -25,7 +25,7 @@ def test_no_value_lies_outside_of_its_bounds(dtype, names):
     for name in names:
         tally.add(check(name, 0, 512, 24, dtype))
     assert tally.misses == 0, tally.examples[:5]
-    assert tally.points > 100_000
+    assert tally.points > 80_000
     assert tally.skipped < tally.checks // 100
 
 
