@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import rounding
-from gsisio_jax.fusion import add_up, once
+from gsisio_jax.fusion import add_up, multiplied, once
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.interval import (
     Interval,
@@ -151,14 +151,13 @@ class Bank(eqx.Module):
     def explicit(self, h: AffineForm, x_before: Interval, terms: Terms) -> Interval:
         """All terms but those in x[k]: box (K, r). Slopes are combined before the box is applied, so that what
         cancels cancels exactly; that is what keeps widths finite on nonlinear systems (design 4.3, step 2)."""
-        parts = self.residual[..., None] * h.slope
-        slope = add_up(parts, -2)
+        slope = once(multiplied(self.residual, h.slope))
         low, high = products(slope, x_before)
         offset_low, offset_high = products(self.residual, h.offset)
         joint = Interval.unchecked(add_up(low) + add_up(offset_low), add_up(high) + add_up(offset_high))
         if rounding.outward():
             # Of the slopes before they cancelled.
-            lost = add_up(scale(add_up(abs(parts), -2), reach(x_before)[..., None, :]))
+            lost = _reached(abs(self.residual), once(_reached(abs(h.slope), reach(x_before))))
             n = 1.0 * sum(h.slope.shape) + 8
             joint = Interval.unchecked(
                 rounding.lowered(joint.lower, lost + add_up(abs(offset_low)), n, n),
@@ -262,11 +261,11 @@ def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box:
     """
     N_z = gains.remainder
     difference = form.slope - C  # (q, n)
-    small = jnp.eye(C.shape[0], dtype=difference.dtype) + _product(difference, N_z)
+    small = jnp.eye(C.shape[0], dtype=difference.dtype) + multiplied(difference, N_z)
     inverse, defect, verified = _verified_inverse(small)
     inverse = once(inverse)
-    through = _product(inverse, difference)
-    correction = once(_product(N_z, through))  # N_z (I + (S-C) N_z)^-1 (S-C)
+    through = multiplied(inverse, difference)
+    correction = once(multiplied(N_z, through))  # N_z (I + (S-C) N_z)^-1 (S-C)
     shifted = add(right, image(-N_z, form.offset))
     solved = image(jnp.eye(C.shape[1], dtype=difference.dtype) - correction, shifted)
     if rounding.outward():
@@ -275,7 +274,7 @@ def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box:
         size, n = sum(C.shape) + 4.0, C.shape[1] + 2.0 * C.shape[0]
         # Residual of B, with what its own evaluation loses, and that of D: |D| far is at hand as a vector.
         thrown = _reached(D, far)
-        of_inverse = defect + rounding.error(_product(B, jnp.eye(C.shape[0], dtype=D.dtype) + _product(D, N)), size)
+        of_inverse = defect + rounding.error(multiplied(B, jnp.eye(C.shape[0], dtype=D.dtype) + multiplied(D, N)), size)
         radius = _reached(N, _reached(of_inverse, thrown))
         # Rounding of M = I - N_z B D, which meets A x, and of D in both: (I + |N||B||D|) (far + |N||D| far).
         image_of_x = far + _reached(N, thrown)
@@ -288,11 +287,6 @@ def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box:
 def _reached(matrix: Any, reach: Any) -> Any:
     """`spread` to nearest."""
     return add_up(scale(matrix, reach[..., None, :]))
-
-
-def _product(a: Any, b: Any) -> Any:
-    """Matrix product of stacks of tiny matrices, written out: a batched dot of such sizes is slow."""
-    return add_up(a[..., :, :, None] * b[..., None, :, :], -2)
 
 
 def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
@@ -308,7 +302,7 @@ def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
         work = work - work[..., :, i : i + 1] * row
         work = jnp.concatenate([work[..., :i, :], row, work[..., i + 1 :, :]], axis=-2)
     inverse = work[..., q:]
-    defect = jnp.abs(_product(inverse, matrix) - identity)
+    defect = jnp.abs(multiplied(inverse, matrix) - identity)
     error = add_up(defect).max(-1) if q else jnp.zeros(matrix.shape[:-2])
     return inverse, defect, error < _INVERSE_RESIDUAL * jnp.finfo(matrix.dtype).eps
 

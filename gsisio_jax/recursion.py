@@ -13,8 +13,9 @@ import jax.numpy as jnp
 
 from gsisio_jax import inclusion, rounding
 from gsisio_jax.contraction import Bank, Evidence, Slips, Terms, centred, magnitude, solve_remainder, strips
-from gsisio_jax.fusion import add_up, once
+from gsisio_jax.fusion import multiplied, once
 from gsisio_jax.inclusion import AffineForm
+from gsisio_jax.inclusion.api import affine_with_slack
 from gsisio_jax.inclusion.methods import bound
 from gsisio_jax.interval import (
     Interval,
@@ -275,13 +276,13 @@ def _inputs(observer: Observer, evidence: Evidence, fixed: Interval, form: Affin
     """Box of d[k-1] from every left inverse, given the box of x[k] (design 4.5)."""
     inverses, box = observer.inverses, evidence.box
     # state x[k] - remainder psi(x[k]) with psi = (S - C) x + [e], slopes combined before the box is applied.
-    parts = inverses.remainder[..., None] * (form.slope - observer.C)
-    slope = inverses.state - add_up(parts, -2)
+    difference = once(form.slope - observer.C)
+    slope = once(inverses.state - multiplied(inverses.remainder, difference))
     now = add(image(slope, box), image(-inverses.remainder, form.offset), fixed)
     if rounding.outward():
         # Of the slopes before they cancelled.
-        lost = slip(abs(inverses.state) + add_up(abs(parts), -2), reach(box))
-        now = widen(now, rounding.error(lost, parts.shape[-2] + 6.0))
+        lost = slip(abs(inverses.state), reach(box)) + slip(abs(inverses.remainder), slip(abs(difference), reach(box)))
+        now = widen(now, rounding.error(lost, difference.shape[0] + 6.0))
     d = Evidence(observer.system.input_bounds, evidence.scale).meet(now, Source.INPUT)
     return d.box, evidence.weigh(d.slacks[0], Source.INPUT) if d.slacks else evidence
 
@@ -351,11 +352,11 @@ def _finish(
 def current_input(current: Any, h: AffineForm, state: Interval, output: Interval) -> Interval:
     """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
     n, weights = state.shape[0], -current
-    parts = weights[..., None] * h.slope[n:]
-    joint = add(image(add_up(parts, -2), state), image(weights, h.offset[n:]))
+    slope = once(multiplied(weights, h.slope[n:]))
+    joint = add(image(slope, state), image(weights, h.offset[n:]))
     if rounding.outward():
-        lost = slip(add_up(abs(parts), -2), reach(state))  # of the slopes before they cancelled
-        joint = widen(joint, rounding.error(lost, parts.shape[-2] + 6.0))
+        lost = slip(abs(weights), slip(abs(h.slope[n:]), reach(state)))  # of the slopes before they cancelled
+        joint = widen(joint, rounding.error(lost, h.slope.shape[0] - n + 6.0))
     return mended(add(intersect(joint, image(weights, h.range[n:]))[0], image(current, output)))
 
 
@@ -376,12 +377,12 @@ def _free_output(observer: Observer, box: Interval, u: Any) -> AffineForm:
 
 def _first_form(observer: Observer, box: Interval, u: Any) -> AffineForm:
     """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes. For x in `box`."""
-    known = observer.first.form
+    known, slack = observer.first.form, observer.first.slack
     if known is None:
-        return inclusion.affine(_free_map(observer))(observer.system.state_bounds, u)
+        known, slack = affine_with_slack(_free_map(observer))(observer.system.state_bounds, u)
     if not rounding.outward():
         return known
-    return AffineForm(known.slope, widen(known.offset, slip(observer.first.slack, reach(box))), known.range)
+    return AffineForm(known.slope, widen(known.offset, slip(slack, reach(box))), known.range)
 
 
 def _free_map(observer: Observer) -> Any:

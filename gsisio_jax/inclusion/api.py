@@ -254,7 +254,9 @@ def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
         def finish(node: Node) -> tuple[AffineForm, Any]:
             slope = slope_of(node, Domain.of(box))
             slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
-            return AffineForm(slope, guard(node.offset), guard(node.range)), slack
+            good, bounds = jnp.isfinite(add_up(abs(slope))), guard(node.range)
+            slope, slack = (jnp.where(good[..., None], v, 0) for v in (slope, slack))
+            return AffineForm(slope, choose(good, guard(node.offset), bounds), bounds), slack
 
         return _run(f, _variable(box), args, finish)
 
