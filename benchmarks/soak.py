@@ -91,9 +91,9 @@ def run_here(what: str, dtype: str, rounding: str, size: str) -> dict[str, Any]:
 def run_apart(what: str, dtype: str, rounding: str, size: float, flags: str) -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.soak", "--part", what, dtype, rounding, str(size)]
     env = {**os.environ, "XLA_FLAGS": FLAGS[flags]}
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, cwd=RESULTS.parent.parent, env=env)
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS.parent)
     given = {"flags": flags, "size": size, "commit": commit.stdout.strip(), "date": time.strftime("%Y-%m-%d %H:%M")}
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, cwd=RESULTS.parent.parent, env=env)
     if done.returncode:
         return given | {"error": f"ended with status {done.returncode}"}
     return given | json.loads(done.stdout.strip().splitlines()[-1])
