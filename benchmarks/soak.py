@@ -34,7 +34,10 @@ def parts(points: float, steps: float) -> dict[str, tuple[str, str, str, float, 
             found[f"primitives {dtype} {flags}"] = ("primitives", dtype, "outward", points * share, flags)
         for dtype in ("float64", "float32"):
             found[f"observers {dtype} {flags}"] = ("observers", dtype, "outward", steps * share, flags)
-            found[f"sums {dtype} {flags}"] = ("sums", dtype, "outward", points / 100 * share, flags)
+            found[f"sums {dtype} {flags}"] = ("sums", dtype, "outward", points / 500 * share, flags)
+        if flags == "quick":
+            for dtype in ("float64", "float32"):
+                found[f"forms {dtype} {flags}"] = ("forms", dtype, "outward", points / 20, flags)
     for dtype in ("float64", "float32"):
         for what, size in (("primitives", points / 100), ("observers", steps / 100), ("sums", points / 1e4)):
             found[f"{what} {dtype} nearest"] = (what, dtype, "nearest", size, "quick")
@@ -101,16 +104,38 @@ def run_apart(what: str, dtype: str, rounding: str, size: float, flags: str) -> 
 
 def summary(found: dict[str, Any]) -> str:
     if "error" in found:
-        return f"FAILED {found['error']}"
-    size = found.get("points") or found.get("steps") or found.get("sums")
-    checks = found.get("checks", size)
-    return (
-        f"{size:,} looked at, {checks:,} numbers against their bounds, {found['misses']:,} misses, {found['seconds']} s"
-    )
+        return f"FAILED: {found['error']}"
+    return f"{looked_at(found)}, {found['misses']:,} misses, {found['seconds']} s"
+
+
+def looked_at(found: dict[str, Any]) -> str:
+    if found["what"] in ("primitives", "forms"):
+        return f"{found['points']:,} points, {found['checks']:,} comparisons"
+    if found["what"] == "observers":
+        return f"{found['steps']:,} steps, {found['checks']:,} comparisons"
+    return f"{found['sums']:,} sums"
 
 
 def table(record: dict[str, Any]) -> str:
-    return "\n".join(f"{name:<30} {summary(found)}" for name, found in record["parts"].items())
+    """The record as a Markdown table."""
+    lines = ["| Part | Looked at | Misses | Nearest to a bound |", "| --- | --- | --- | --- |"]
+    for name, found in record["parts"].items():
+        if "error" in found:
+            lines.append(f"| {name} | {summary(found)} | | |")
+            continue
+        nearest = name.endswith("nearest")
+        lines.append(f"| {name} | {looked_at(found)} | {found['misses']:,} | {'' if nearest else _closest(found)} |")
+    return "\n".join(lines)
+
+
+def _closest(found: dict[str, Any]) -> str:
+    """What came nearest to a bound, in eps of its value."""
+    if found["what"] == "primitives":
+        return found["closest"][0].replace(" of the value", "") if found["closest"] else ""
+    if found["what"] == "observers":
+        room, name = min((plant["closest_eps"], name) for name, plant in found["plants"].items())
+        return f"{name}: {room} eps"
+    return ""
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ A miss is a miss by any amount at all: crival's intervals decide where they are 
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -20,7 +19,7 @@ from sampling import boxes, points
 from gsisio_jax import Interval, inclusion
 from gsisio_jax.rounding import Rounding
 
-MOST_BALLS = 4000  # points of one batch that are decided by balls
+MOST_BALLS = 1000  # numbers of one kind and batch that are decided by balls
 
 
 @dataclass
@@ -44,7 +43,6 @@ class Tally:
     skipped: int = 0
     closest: dict[str, float] = field(default_factory=dict)
     examples: list[Any] = field(default_factory=list)
-    by_kind: Counter[str] = field(default_factory=Counter)
 
     def add(self, other: Tally) -> None:
         for name in ("points", "checks", "misses", "balls", "skipped"):
@@ -52,7 +50,6 @@ class Tally:
         for name, room in other.closest.items():
             self.closest[name] = min(room, self.closest.get(name, np.inf))
         self.examples = (self.examples + other.examples)[:20]
-        self.by_kind += other.by_kind
 
 
 @lru_cache(maxsize=512)
@@ -83,6 +80,40 @@ def check(
     return compare(name, lower, upper, found, points(rng, lower, upper, each, real))
 
 
+FORMS = ("mean_value", "decomposition", "remainder", "tight")
+
+
+@lru_cache(maxsize=64)
+def forms_of(name: str, rounding: Rounding) -> Any:
+    """The bounds that are made of others, on a batch of boxes."""
+    fn = FUNCTIONS[name].fn
+    forms = [getattr(inclusion, form)(fn, rounding=rounding) for form in FORMS]
+
+    def call(lower: Any, upper: Any) -> Any:
+        found = [form(Interval.unchecked(lower, upper)) for form in forms]
+        return [(box.lower, box.upper) for box in found]
+
+    return jax.jit(jax.vmap(call))
+
+
+def check_forms(name: str, seed: int, many: int, each: int, dtype: Any, rounding: Rounding = "outward") -> Tally:
+    """As `check`, for the values alone: mean-value form, decompositions, remainder form."""
+    real, rng, tally = FUNCTIONS[name], np.random.default_rng([seed, sum(map(ord, name)), 1]), Tally()
+    lower, upper = boxes(rng, many, dtype, real)
+    found = jax.tree.map(np.asarray, forms_of(name, rounding)(jnp.asarray(lower), jnp.asarray(upper)))
+    t = points(rng, lower, upper, each, real)
+    args = [ival.Interval(t[..., i].astype(np.float64)) for i in range(t.shape[-1])]
+    inside, value = (t[..., 0] >= real.domain[0]) & (t[..., 0] <= real.domain[1]), real.value(*args)
+
+    def ball(i: int, j: int) -> Any:
+        return real.ball(*(arb(float(v)) for v in t[i, j]))
+
+    for form, box in zip(FORMS, found, strict=True):
+        _judge(tally, name, form, Interval.unchecked(*box), value, inside, ball, (lower, upper, t))
+        tally.points += int((inside & ~np.isnan(value.lo)).sum())
+    return tally
+
+
 def compare(name: str, lower: np.ndarray, upper: np.ndarray, bounds: Any, t: np.ndarray) -> Tally:
     """Points t (boxes, each, n) of the boxes (boxes, n) against the bounds there."""
     natural, met, slope, offset, jac = bounds
@@ -93,7 +124,7 @@ def compare(name: str, lower: np.ndarray, upper: np.ndarray, bounds: Any, t: np.
         assert (box.lower <= box.upper).all(), f"{name}: crossed"
     assert np.isfinite(slope).all(), f"{name}: slope"
     real, tally = FUNCTIONS[name], Tally()
-    (many, each, n), args = t.shape, [ival.Interval(t[..., i].astype(np.float64)) for i in range(t.shape[-1])]
+    (_, each, n), args = t.shape, [ival.Interval(t[..., i].astype(np.float64)) for i in range(t.shape[-1])]
     inside = (t[..., 0] >= real.domain[0]) & (t[..., 0] <= real.domain[1])
     strictly = (t[..., 0] > real.domain[0]) & (t[..., 0] < real.domain[1])
     value = real.value(*args)
@@ -126,26 +157,36 @@ def compare(name: str, lower: np.ndarray, upper: np.ndarray, bounds: Any, t: np.
             )
         )
     for what, box, truth, where, exact in quantities:
-        low, high = (np.broadcast_to(v[:, None].astype(np.float64), (many, each)) for v in (box.lower, box.upper))
-        seen = where & ~np.isnan(truth.lo)
-        good = seen & (low <= truth.lo) & (truth.hi <= high)
-        bad = seen & ((truth.hi < low) | (truth.lo > high))
-        for i, j in np.argwhere(seen & ~good & ~bad):
-            if tally.balls >= MOST_BALLS:
-                break
-            verdict = _by_ball(exact, i, j, low[i, j], high[i, j])
-            good[i, j], bad[i, j] = verdict is True, verdict is False
-            tally.balls += 1
-        checks = int(good.sum()) + int(bad.sum())
-        tally.checks, tally.misses = tally.checks + checks, tally.misses + int(bad.sum())
+        checks, good, low, high = _judge(tally, name, what, box, truth, where, exact, (lower, upper, t))
         tally.points += checks if what == "natural" else 0
-        tally.skipped += int(seen.sum()) - checks
-        for i, j in np.argwhere(bad)[:3]:
-            ends = (lower[i].tolist(), upper[i].tolist(), t[i, j].tolist())
-            tally.examples.append((name, what, *ends, float(truth.lo[i, j]), float(low[i, j]), float(high[i, j])))
         if what == "affine":
             tally.closest[name] = _room(truth, low, high, good, np.finfo(lower.dtype))
     return tally
+
+
+def _judge(
+    tally: Tally, name: str, what: str, box: Interval, truth: Any, where: Any, exact: Any, given: tuple[Any, Any, Any]
+) -> tuple[int, Any, Any, Any]:
+    """True values (boxes, each) against one pair of bounds for every box; counted in `tally`."""
+    lower, upper, t = given
+    assert not (np.isnan(box.lower) | np.isnan(box.upper) | (box.lower > box.upper)).any(), f"{name}, {what}: no box"
+    low, high = (np.broadcast_to(v[:, None].astype(np.float64), truth.lo.shape) for v in (box.lower, box.upper))
+    seen = where & ~np.isnan(truth.lo)
+    good = seen & (low <= truth.lo) & (truth.hi <= high)
+    bad = seen & ((truth.hi < low) | (truth.lo > high))
+    for count, (i, j) in enumerate(np.argwhere(seen & ~good & ~bad)):
+        if count >= MOST_BALLS:
+            break
+        verdict = _by_ball(exact, i, j, low[i, j], high[i, j])
+        good[i, j], bad[i, j] = verdict is True, verdict is False
+        tally.balls += 1
+    checks = int(good.sum()) + int(bad.sum())
+    tally.checks, tally.misses = tally.checks + checks, tally.misses + int(bad.sum())
+    tally.skipped += int(seen.sum()) - checks
+    for i, j in np.argwhere(bad)[:3]:
+        ends = (lower[i].tolist(), upper[i].tolist(), t[i, j].tolist())
+        tally.examples.append((name, what, *ends, float(truth.lo[i, j]), float(low[i, j]), float(high[i, j])))
+    return checks, good, low, high
 
 
 def _by_ball(exact: Any, i: int, j: int, low: float, high: float) -> bool | None:

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from checks import Tally, check
+from checks import Tally, check, check_forms
 from oracles.exact_sums import product, sign
 from oracles.real_functions import FUNCTIONS
 from plants import LINEAR, NONLINEAR, QUADRATIC
@@ -66,6 +66,27 @@ def primitives(dtype: Any, points: float, seed: int, rounding: Rounding = "outwa
         "turns": turns,
         "closest_eps": closest,
         "closest": [f"{name}: {room} eps of the value" for room, name in least],
+        "examples": [str(example) for example in total.examples[:5]],
+        "seconds": round(time.perf_counter() - started),
+    }
+
+
+def forms(dtype: Any, points: float, seed: int, rounding: Rounding = "outward") -> dict[str, Any]:
+    """Mean-value form, decomposition, remainder form and their best, for every third function."""
+    total, started, names = Tally(), time.perf_counter(), list(FUNCTIONS)[1::3]
+    many = int(max(64, min(4096, points / (4 * POINTS * len(names)))))
+    while total.points < points:
+        for name in names:
+            total.add(check_forms(name, seed, max(many // RARE.get(name, 1), 64), POINTS, dtype, rounding))
+        seed += 1
+        _tell("forms", total.points, total.misses, total.examples, started)
+    return {
+        "what": "forms",
+        "functions": names,
+        "points": total.points,
+        "checks": total.checks,
+        "misses": total.misses,
+        "undecided": total.skipped,
         "examples": [str(example) for example in total.examples[:5]],
         "seconds": round(time.perf_counter() - started),
     }

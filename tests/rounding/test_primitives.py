@@ -8,7 +8,7 @@ import ival
 import jax
 import numpy as np
 import pytest
-from checks import Tally, bounds_of, check, compare
+from checks import Tally, bounds_of, check, check_forms, compare
 from flint import arb, ctx
 from oracles.real_functions import FUNCTIONS
 from sampling import boxes, points
@@ -48,6 +48,11 @@ def test_the_same_bounds_hold_eager_and_for_one_box():
             found = bounds_of(name, "outward", jit, batched=False)(lower[i], upper[i])
             batch = jax.tree.map(lambda v: np.asarray(v)[None], found)
             assert compare(name, lower[i : i + 1], upper[i : i + 1], batch, t[i : i + 1]).misses == 0
+
+
+def test_forms_made_of_others_hold_too():
+    """Mean-value form, decompositions: a function at single points, some of which are flushed to zero."""
+    assert check_forms("reciprocal", 0, 512, 24, np.float32).misses == 0
 
 
 def test_the_two_oracles_agree():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from soak import observers, primitives, sums
+from soak import forms, observers, primitives, sums
 
 pytestmark = pytest.mark.soak
 DTYPES = pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
@@ -18,6 +18,12 @@ def test_a_hundred_million_primitives(dtype):
 
 
 @DTYPES
+def test_forms_made_of_others(dtype):
+    found = forms(dtype, 1e6, 100)
+    assert found["misses"] == 0, found["examples"]
+
+
+@DTYPES
 def test_ten_million_observer_steps(dtype):
     found = observers(dtype, 1e7, 100)
     print("\n", found)
@@ -26,7 +32,7 @@ def test_ten_million_observer_steps(dtype):
 
 @DTYPES
 def test_deep_sums(dtype):
-    assert sums(dtype, 1e6, 100)["misses"] == 0
+    assert sums(dtype, 2e5, 100)["misses"] == 0
 
 
 @DTYPES
