@@ -34,8 +34,8 @@ class Estimate(eqx.Module):
         margin: (T,) signed slack of the tightest intersection of the step; negative is the size of a contradiction, in
             the unit of the component that `alarms` names.
         source: (T,) code of that intersection (`gsisio_jax.status.Source`).
-        guaranteed: the boxes hold on the machine, rounding included; False for ``rounding="nearest"`` and where the
-            observer is none.
+        guaranteed: the boxes hold on the machine, rounding included; False for ``rounding="nearest"`` and for the
+            prediction form, whose boxes hold up to rounding errors (where they are framers at all).
 
     Source: design 7 and 4.6.
     """
@@ -246,7 +246,8 @@ def _rows_from(noise: Noise, k: int) -> Noise:
 def _as_estimate(observer: AnyObserver, out: StepOutput) -> Estimate:
     return Estimate(
         out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows,
-        observer.guaranteed and observer.rounding == "outward",
+        # What the gains of the prediction form leave of d by rounding is not bounded.
+        isinstance(observer, Observer) and observer.guaranteed,
     )  # fmt: skip
 
 
@@ -294,7 +295,8 @@ def _prepare(
         )
     if is_concrete(y) and np.isinf(np.asarray(y)).any():
         raise ValueError(f"{call}: a measurement is infinite; mark missing entries with NaN")
-    dtype = jnp.result_type(initial.dtype, y.dtype)
+    # Arrays of 64 bits may come where JAX has 32 by now: each type first by itself, which is silent.
+    dtype = jnp.result_type(*map(jax.dtypes.canonicalize_dtype, (initial.dtype, y.dtype)))
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
     dtype = jax.dtypes.canonicalize_dtype(dtype)
