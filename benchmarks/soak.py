@@ -59,12 +59,14 @@ def main() -> int:
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{options.name}.json"
     record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"parts": {}}
-    for name, (what, dtype, rounding, size, flags) in parts(options.points, options.steps).items():
+    wanted = parts(options.points, options.steps)
+    for name, (what, dtype, rounding, size, flags) in wanted.items():
         if options.only not in name or (name in record["parts"] and not options.again):
             continue
         print(f"{name}, {size:.0e} ...", file=sys.stderr, flush=True)
         found = run_apart(what, dtype, rounding, size, flags)
         record["parts"][name] = found
+        record["parts"] = {key: record["parts"][key] for key in wanted if key in record["parts"]}
         record["setting"] = setting() | {p: version(p) for p in ("crival", "python-flint")} | {"seed": SEED}
         path.write_text(json.dumps(record, indent=1) + "\n")
         print(f"  {summary(found)}", file=sys.stderr, flush=True)
