@@ -175,7 +175,7 @@ def guarded(
             row_slips(wide.exact.circuits, wide.exact.circuits_known, system, False, wide.bounded_inputs, H_slack),
             dtype,
         ),
-        input_inverses=_cast(np.array(list(inverses.values())).reshape(-1, p, p), dtype),
+        input_inverses=_cast(np.array(list(inverses.values())).reshape(len(inverses), p, p), dtype),
         input_state=_cast(input_state, dtype),
         growth=_cast(_slope(-wide.gains.residual[0], region, n), dtype),
         input_growth=_cast(_slope(-wide.inverses.residual[0], region, n), dtype),

@@ -72,7 +72,8 @@ def slips(bank: Bank, plant: Any, C: Any, bounded: Any, known: Any, states: bool
         through = A.dot(G) + B.dot(H) - Kd.dot(D)
         of_d.append(rounded_up(abs(through if states else eye_d + through) + abs(B).dot(slack)))
     rows = n if states else p
-    return Slips(np.array(of_x).reshape(-1, rows, n), np.array(of_d).reshape(-1, rows, p))
+    count = len(bank.residual)
+    return Slips(np.array(of_x).reshape(count, rows, n), np.array(of_d).reshape(count, rows, p))
 
 
 def row_slips(rows: Any, known: Any, plant: Any, identity: bool, bounded: Any, H_slack: Any) -> np.ndarray:

@@ -233,8 +233,10 @@ def angle(y: Any, x: Any) -> Node:
 def _safe_root(edge: Any, slope: Any) -> Any:
     """Where the derivative ``edge / (edge^2 + t^2)`` along an edge equals the slope: t >= 0, or 0 if nowhere."""
     edge, slope = jax.lax.stop_gradient(edge), jax.lax.stop_gradient(slope)
-    square = edge / jnp.where(slope == 0, 1, slope) - edge * edge
-    return jnp.sqrt(jnp.where((slope != 0) & (square > 0), square, 0))
+    # The square of t is edge * rest; it would vanish where t itself does not.
+    rest = 1 / jnp.where(slope == 0, 1, slope) - edge
+    there = (slope != 0) & (edge != 0) & ((rest > 0) == (edge > 0))
+    return jnp.where(there, jnp.sqrt(jnp.where(there, abs(edge), 1)) * jnp.sqrt(jnp.where(there, abs(rest), 1)), 0)
 
 
 def _angle_at(y: Any, x: Any) -> Any:
@@ -251,7 +253,11 @@ def _pull(a: Interval, b: Interval, smooth: Any) -> Interval:
     def at(p: Any, q: Any) -> Any:
         good = smooth & jnp.isfinite(p) & jnp.isfinite(q) & ((p != 0) | (q != 0))
         p, q = jnp.where(good, p, 0), jnp.where(good, q, 1)
-        return p / (p * p + q * q)
+        # Over the larger one first: squares of the numbers themselves would overflow or vanish. By its reciprocal, as
+        # XLA makes one quotient of two, with the square in it that is to be avoided.
+        over = 1 / jax.lax.stop_gradient(jnp.where(abs(p) > abs(q), p, q))
+        p, q = p * over, q * over
+        return p / jnp.maximum(p * p + q * q, 1) * over
 
     values = [at(p, q) for p in (a.lower, a.upper) for q in (b.lower, b.upper)]
     zero = jnp.clip(jnp.zeros_like(b.lower), b.lower, b.upper)
@@ -259,5 +265,6 @@ def _pull(a: Interval, b: Interval, smooth: Any) -> Interval:
     for q in (b.lower, b.upper):
         values += [at(jnp.clip(side * q, a.lower, a.upper), q) for side in (1, -1)]
     pull = extremes(values)
-    pull = Interval.unchecked(rounding.down(pull.lower, 8.0), rounding.up(pull.upper, 8.0))
+    lower, upper = rounding.overflowed(pull.lower), -rounding.overflowed(-pull.upper)
+    pull = Interval.unchecked(rounding.down(lower, 16.0), rounding.up(upper, 16.0))
     return choose(smooth, pull, entire_like(a.lower))

@@ -211,11 +211,14 @@ def scaled_slack(factor: Any, slope: Any, product: Any, slack: Any, ulps: float 
         low, high = rounding.known_product(factor, slope)
         new = high - low if ulps == 2.0 else 4 * np.spacing(np.abs(product)) * (product != 0)
         return sum_slack(new, None if slack is None else np.abs(factor) * slack)
+    info = jnp.finfo(product.dtype)
+    kind = np.dtype(product.dtype).type
     before = None if slack is None else abs(factor) * slack
     if ulps == 2.0 and is_known(factor) and is_exact(factor):
         return sum_slack(before)
-    info = jnp.finfo(product.dtype)
-    kind = np.dtype(product.dtype).type
+    if before is not None:
+        # A slack that is flushed to zero would be lost for good, however far the box reaches.
+        before = before + jax.lax.stop_gradient(jnp.where((factor == 0) | (slack == 0), 0, kind(info.tiny)))
     lost = abs(product) * kind(ulps * info.eps) + kind(info.tiny)
     return sum_slack(jax.lax.stop_gradient(jnp.where((factor == 0) | (slope == 0), 0, lost)), before)
 

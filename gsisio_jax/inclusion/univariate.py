@@ -289,8 +289,9 @@ class Pole:
     k: int
 
     def _side(self, a: Any, b: Any) -> tuple[Any, Any, Any, Any]:
-        """Is 0 strictly inside, are we on the left of 0, and the interval of |t| (of 1 where 0 is inside)."""
-        split, left = (a < 0) & (b > 0), b <= 0
+        """Is 0 strictly inside (or all there is, as after a subnormal number was flushed), are we on the left of 0, and
+        the interval of |t| (of 1 where 0 is inside)."""
+        split, left = ((a < 0) & (b > 0)) | ((a == 0) & (b == 0)), b <= 0
         near, far = jnp.where(left, -b, a), jnp.where(left, -a, b)
         return split, left, jnp.where(split, 1, near), jnp.where(split, 1, far)
 

@@ -1,0 +1,42 @@
+"""A hundred million primitives and ten million observer steps, in each precision (`pytest -m soak`, an hour or two)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from soak import forms, observers, primitives, sums
+
+pytestmark = pytest.mark.soak
+DTYPES = pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+
+
+@DTYPES
+def test_a_hundred_million_primitives(dtype):
+    found = primitives(dtype, 1e8, 100)
+    print("\n", found)
+    assert found["misses"] == 0, found["examples"]
+
+
+@DTYPES
+def test_forms_made_of_others(dtype):
+    found = forms(dtype, 1e6, 100)
+    assert found["misses"] == 0, found["examples"]
+
+
+@DTYPES
+def test_ten_million_observer_steps(dtype):
+    found = observers(dtype, 1e7, 100)
+    print("\n", found)
+    assert (found["misses"], found["conflicts"]) == (0, 0), found["plants"]
+
+
+@DTYPES
+def test_deep_sums(dtype):
+    assert sums(dtype, 2e5, 100)["misses"] == 0
+
+
+@DTYPES
+def test_rounded_to_nearest_all_of_them_fail(dtype):
+    assert primitives(dtype, 1e6, 100, "nearest")["misses"] > 1e5
+    assert observers(dtype, 1e5, 100, "nearest")["misses"] > 1e4
+    assert sums(dtype, 1e4, 100, "nearest")["misses"] > 1e3
