@@ -15,6 +15,7 @@ from gsisio_jax.inclusion.abstraction import Abstraction
 from gsisio_jax.inclusion.api import AffineForm, affine, jacobian, mean_value, natural
 from gsisio_jax.inclusion.decomposition import decomposition, remainder
 from gsisio_jax.interval import Interval, choose
+from gsisio_jax.ties import larger, smaller
 
 METHODS = ("affine", "natural", "decomposition", "remainder", "mean_value", "abstraction")
 DEFAULT = ("affine", "natural")
@@ -95,7 +96,7 @@ def bound(
 
 def _meet(a: Interval, b: Interval) -> Interval:
     """Intersection of two bounds of the same values; where rounding makes them miss each other, the first."""
-    lower, upper = jnp.maximum(a.lower, b.lower), jnp.minimum(a.upper, b.upper)
+    lower, upper = larger(a.lower, b.lower), smaller(a.upper, b.upper)
     return choose(lower <= upper, Interval.unchecked(lower, upper), a)
 
 
@@ -106,7 +107,7 @@ def _mean_value_form(f: Callable[..., Any], box: Interval, *args: Any) -> Affine
     slope = jnp.where(finite, enclosure.center, 0)
     around = Interval.unchecked(box.lower - center, box.upper - center)
     radius = jnp.where(finite, enclosure.radius, jnp.inf)
-    reach = jnp.maximum(-around.lower, around.upper)
+    reach = larger(-around.lower, around.upper)
     spread = jnp.where(reach == 0, 0, jnp.where(radius == 0, 0, radius * reach)).sum(-1)
     at_center = natural(f)(Interval.unchecked(center, center), *args)
     middle = Interval.unchecked(at_center.lower - slope @ center, at_center.upper - slope @ center)

@@ -12,6 +12,7 @@ import numpy as np
 from gsisio_jax.inclusion.api import _typed, jacobian, natural
 from gsisio_jax.inclusion.node import guard, times
 from gsisio_jax.interval import Interval, is_concrete
+from gsisio_jax.ties import larger, smaller
 
 
 def room(a: Any, b: Any, behind: Any, ahead: Any) -> Any:
@@ -19,7 +20,7 @@ def room(a: Any, b: Any, behind: Any, ahead: Any) -> Any:
 
     With the two distances exchanged, how far it can rise. The place to widen for rounding.
     """
-    return jnp.maximum(jnp.maximum(times(-a, ahead), times(b, behind)), 0)
+    return larger(larger(times(-a, ahead), times(b, behind)), 0)
 
 
 def is_box(value: Any) -> bool:
@@ -156,7 +157,7 @@ class Rows:
 
         Bounds of a row that is nearly constant can cross by rounding: the box between them is then the best there is.
         """
-        box = guard(Interval.unchecked(jnp.minimum(lower, upper), jnp.maximum(lower, upper)))
+        box = guard(Interval.unchecked(smaller(lower, upper), larger(lower, upper)))
         pairs = self.unflatten(box.lower), self.unflatten(box.upper)
         return jax.tree.map(Interval.unchecked, *pairs)
 

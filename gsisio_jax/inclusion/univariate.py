@@ -264,7 +264,7 @@ class Pole:
             result = Interval.unchecked(jnp.where(left, -high, low), jnp.where(left, -low, high))
             return choose(split, entire_like(a), result)
         # An even pole inside: bounded below by the value at the end that is farther from 0.
-        far = jnp.maximum(-a, b)
+        far = larger(-a, b)
         return Interval.unchecked(jnp.where(split, self._power(far, self.k), low), jnp.where(split, INF, high))
 
     def derivative(self, a: Any, b: Any) -> Interval:
