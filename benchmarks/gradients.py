@@ -55,14 +55,15 @@ def points(name: str, count: int) -> dict[str, Any]:
     from benchmarks.plants import from_tests
 
     checks, systems = from_tests("gradient_points"), from_tests("systems")
-    checker = checks.Checker(getattr(systems, name)(), count)
-    report = checker.check(checker.draw())
+    checker = checks.Checker(getattr(systems, name)(), count, checks.folded)
+    report, not_finite = checker.check(checker.draw()), checker.not_finite()
     return {
         "points": count,
         "worst": {kind: float(report.error[:, i].max()) for i, kind in enumerate(checks.KINDS)},
         "kinks": int(report.kink.sum()),
         "subgradients": int(report.between[report.kink].sum()),
-        "ok": bool((report.error < 1e-4).all()),
+        "not_finite": not_finite,
+        "ok": bool((report.error < 1e-4).all()) and not not_finite,
     }
 
 
@@ -122,7 +123,8 @@ def line(case: str, result: dict[str, Any]) -> str:
     worst = ", ".join(f"{kind} {error:.1e}" for kind, error in result["worst"].items())
     return (
         f"{case}: {result['points']} points, worst relative error: {worst}; {result['kinks']} kinks, derivative "
-        f"between both sides at {result['subgradients']}  {state}"
+        f"between both sides at {result['subgradients']}; not finite: {', '.join(result['not_finite']) or 'nowhere'}  "
+        f"{state}"
     )
 
 

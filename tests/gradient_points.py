@@ -1,10 +1,12 @@
-"""Gradients of a run against central differences, at random points of a test system and in random directions.
+"""Gradients of a run against central differences, at random points of a test system and in random directions; and
+points at which a careless derivative is NaN.
 
-The gradient goes through `tuning.fold`, the differences through `estimate`, so each checks the other.
+The gradient may go through `tuning.fold`: the differences go through `estimate`, so each checks the other.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,6 +20,7 @@ from gsisio_jax.tuning import fold
 
 STEPS = 6
 STEP = 1e-6
+NAN, INF = np.nan, np.inf
 KINDS = ("initial box", "record", "noise")
 
 
@@ -55,13 +58,17 @@ class Report:
 
 
 class Checker:
-    """A test system, with its gradient and its values compiled for `points` points."""
+    """A test system, with its gradient and its values compiled for `points` points.
 
-    def __init__(self, case: systems.Case, points: int):
+    `through` is what the gradient goes through, `score` or `folded`; `options` are those of the design.
+    """
+
+    def __init__(self, case: systems.Case, points: int, through: Callable[..., Any], **options: Any):
         self.case, self.points = replace(case, steps=STEPS), points
-        observer, u = case.design(missing=False), jnp.asarray(case.u(STEPS))
-        self.gradients = jax.jit(jax.vmap(jax.grad(lambda at: folded(observer, u, at))))
+        observer, u = case.design(missing=False, **options), jnp.asarray(case.u(STEPS))
+        self.gradients = jax.jit(jax.vmap(jax.grad(lambda at: through(observer, u, at))))
         self.values = jax.jit(jax.vmap(lambda at: score(observer, u, at)))
+        self.estimates = jax.jit(jax.vmap(lambda at: gx.estimate(observer, at[0], at[1], u, at[2])))
 
     def draw(self, seed: int = 5) -> Any:
         """Random initial boxes, records and noise bounds around those of the system, as NumPy arrays."""
@@ -83,6 +90,63 @@ class Checker:
             return gx.Interval(initial.center - low, initial.center + high), record.y, gx.Noise(*bounds)
 
         return jax.tree.map(np.array, one(jax.random.split(jax.random.key(seed), self.points)))
+
+    def hard(self) -> tuple[list[str], Any]:
+        """Points at which a careless derivative is NaN, with their names; the rest of the batch stays random."""
+        initial, y, noise = self.draw()
+        names: list[str] = []
+
+        def at(name: str) -> int:
+            names.append(name)
+            return len(names) - 1
+
+        y[at("one row missing"), 2] = NAN
+        y[at("one entry missing"), 3, 0] = NAN
+        y[at("first row missing"), 0] = NAN
+        y[at("last row missing"), -1] = NAN
+        y[at("all rows missing")] = NAN
+        i = at("initial box infinite")
+        initial.lower[i], initial.upper[i] = -INF, INF
+        initial.upper[at("one side infinite"), 0] = INF
+        i = at("initial box infinite, first row missing")
+        initial.lower[i], initial.upper[i], y[i, 0] = -INF, INF, NAN
+        i = at("initial box infinite, all rows missing")
+        initial.lower[i], initial.upper[i], y[i] = -INF, INF, NAN
+        i = at("initial box of zero width")
+        initial.lower[i] = initial.upper[i] = self.case.initial.center
+        i = at("initial box of zero width at 0")
+        initial.lower[i] = initial.upper[i] = 0
+        i = at("no noise")
+        for bound in jax.tree.leaves(noise):
+            bound[i] = 0
+        i = at("no noise, initial box of zero width, all zero")
+        for bound in jax.tree.leaves((initial, y, noise)):
+            bound[i] = 0
+        i = at("noise without bounds")
+        noise.v.lower[i], noise.v.upper[i] = -INF, INF
+        i = at("lower side at 0")
+        initial.lower[i] = 0
+        y[at("conflict in row 0"), 0] += 1e3
+        y[at("conflict in row 3"), 3] -= 1e3
+        i = at("conflict, then a missing row")
+        y[i, 3], y[i, 4] = y[i, 3] + 1e3, NAN
+        i = at("conflict with an infinite initial box")
+        initial.lower[i], initial.upper[i], y[i, 2] = -INF, INF, 1e6
+        i = at("huge initial box")
+        initial.lower[i], initial.upper[i] = -1e150, 1e150
+        i = at("tiny noise")
+        for bound in jax.tree.leaves(noise):
+            bound[i] *= 1e-12
+        return names, (initial, y, noise)
+
+    def not_finite(self) -> list[str]:
+        """Names of the hard points whose gradient has a NaN or an infinite entry."""
+        names, point = self.hard()
+        finite = np.ones(self.points, dtype=bool)
+        for leaf in jax.tree.leaves(self.gradients(point)):
+            finite &= np.isfinite(np.asarray(leaf)).reshape(self.points, -1).all(axis=1)
+        names += ["a random point"] * (self.points - len(names))
+        return [name for name, good in zip(names, finite, strict=True) if not good]
 
     def check(self, point: Any, seed: int = 3) -> Report:
         random = np.random.default_rng(seed)

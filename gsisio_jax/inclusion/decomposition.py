@@ -30,6 +30,7 @@ from gsisio_jax.inclusion.boxes import times
 from gsisio_jax.inclusion.rows import Rows, check_derivative, room
 from gsisio_jax.interval import Interval
 from gsisio_jax.rounding import Rounding, as_nearest, rounded_by
+from gsisio_jax.ties import larger, largest, smaller, smallest
 
 MAX_CORNER_DIMENSION = 10
 """`remainder` evaluates f at 2^n corners: n may not be larger than this."""
@@ -196,7 +197,7 @@ def remainder(f: Callable[..., Any], derivative: Any = None, rounding: Rounding 
         points = rows.between(corners)
         # All corners for all rows: (2^n, 1, n) against (m, n).
         lower, upper = rows.around(points[:, None], rows.values(points), a, b)
-        return rows.pack(lower.max(0), upper.min(0))
+        return rows.pack(largest(lower, 0), smallest(upper, 0))
 
     return bounds
 
@@ -233,7 +234,7 @@ def tight(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | No
         known = rows.flatten(
             jax.tree.map(lambda v: v.range, affine(f)(rows.box, *args), is_leaf=lambda v: isinstance(v, AffineForm))
         )
-        return rows.pack(jnp.maximum(lower, known.lower), jnp.minimum(upper, known.upper))
+        return rows.pack(larger(lower, known.lower), smaller(upper, known.upper))
 
     return bounds
 

@@ -35,6 +35,7 @@ from gsisio_jax.inclusion.node import (
 )
 from gsisio_jax.inclusion.univariate import apply
 from gsisio_jax.interval import Interval, choose, entire_like, hull
+from gsisio_jax.ties import larger, smaller
 
 LOG_ADD_EXP_ULPS = 512.0
 
@@ -203,7 +204,7 @@ def maximum(x: Any, y: Any) -> Node:
         y = as_node(y, x.shape, x.dtype)
     x, y = settled(x), settled(y)
     a, b = x.range, y.range
-    natural = Interval.unchecked(jnp.maximum(a.lower, b.lower), jnp.maximum(a.upper, b.upper))
+    natural = Interval.unchecked(larger(a.lower, b.lower), larger(a.upper, b.upper))
     box, jac = parts([x, y])
     gap = settled(subtract(Node(x.range, x.form), Node(y.range, y.form)))
     first, second = gap.range.lower >= 0, gap.range.upper <= 0
@@ -291,6 +292,6 @@ def _select_plain(which: Any, *cases: Any) -> Any:
 def _possible_hull(possible: Sequence[Any], cases: Sequence[Interval]) -> Interval:
     lower, upper = jnp.inf, -jnp.inf
     for mask, case in zip(possible, cases, strict=True):
-        lower = jnp.minimum(lower, jnp.where(mask, case.lower, jnp.inf))
-        upper = jnp.maximum(upper, jnp.where(mask, case.upper, -jnp.inf))
+        lower = smaller(lower, jnp.where(mask, case.lower, jnp.inf))
+        upper = larger(upper, jnp.where(mask, case.upper, -jnp.inf))
     return Interval.unchecked(lower, upper)

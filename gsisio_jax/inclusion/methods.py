@@ -16,6 +16,7 @@ from gsisio_jax.inclusion.api import AffineForm, affine, distance, jacobian, mea
 from gsisio_jax.inclusion.decomposition import decomposition, remainder
 from gsisio_jax.interval import Interval, choose, reach
 from gsisio_jax.rounding import Rounding, lowered, raised, rounded_by, unbounded, up
+from gsisio_jax.ties import larger, smaller
 
 METHODS = ("affine", "natural", "decomposition", "remainder", "mean_value", "abstraction")
 DEFAULT = ("affine", "natural")
@@ -99,7 +100,7 @@ def bound(
 
 def _meet(a: Interval, b: Interval) -> Interval:
     """Intersection of two bounds of the same values; where rounding makes them miss each other, the first."""
-    lower, upper = jnp.maximum(a.lower, b.lower), jnp.minimum(a.upper, b.upper)
+    lower, upper = larger(a.lower, b.lower), smaller(a.upper, b.upper)
     return choose(lower <= upper, Interval.unchecked(lower, upper), a)
 
 
@@ -108,7 +109,7 @@ def _mean_value_form(f: Callable[..., Any], box: Interval, *args: Any) -> Affine
     enclosure, center = jacobian(f)(box, *args), box.center
     finite = jnp.isfinite(enclosure.lower) & jnp.isfinite(enclosure.upper)
     slope = jnp.where(finite, enclosure.center, 0)
-    radius = jnp.where(finite, up(jnp.maximum(enclosure.upper - slope, slope - enclosure.lower)), jnp.inf)
+    radius = jnp.where(finite, up(larger(enclosure.upper - slope, slope - enclosure.lower)), jnp.inf)
     radius = jnp.where(enclosure.lower == enclosure.upper, 0, radius)
     around = reach(distance(box, center))
     spread = jnp.where(around == 0, 0, jnp.where(radius == 0, 0, radius * around))

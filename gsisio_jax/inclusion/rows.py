@@ -13,6 +13,7 @@ from gsisio_jax import rounding
 from gsisio_jax.inclusion.api import _typed, distance, jacobian, natural
 from gsisio_jax.inclusion.boxes import guard, times
 from gsisio_jax.interval import Interval, is_concrete
+from gsisio_jax.ties import larger, smaller
 
 
 def room(a: Any, b: Any, behind: Any, ahead: Any) -> Any:
@@ -20,7 +21,7 @@ def room(a: Any, b: Any, behind: Any, ahead: Any) -> Any:
 
     With the two distances exchanged, how far it can rise. To nearest: the sum is what gets widened.
     """
-    return jnp.maximum(jnp.maximum(times(-a, ahead), times(b, behind)), 0)
+    return larger(larger(times(-a, ahead), times(b, behind)), 0)
 
 
 def is_box(value: Any) -> bool:
@@ -159,7 +160,7 @@ class Rows:
 
         Bounds of a row that is nearly constant can cross by rounding: the box between them is then the best there is.
         """
-        box = guard(Interval.unchecked(jnp.minimum(lower, upper), jnp.maximum(lower, upper)))
+        box = guard(Interval.unchecked(smaller(lower, upper), larger(lower, upper)))
         pairs = self.unflatten(box.lower), self.unflatten(box.upper)
         return jax.tree.map(Interval.unchecked, *pairs)
 

@@ -314,7 +314,7 @@ class Pole:
             result = Interval.unchecked(jnp.where(left, -high, low), jnp.where(left, -low, high))
             return choose(split, entire_like(a), result)
         # An even pole inside: bounded below by the value at the end that is farther from 0.
-        low = jnp.where(split, self._between(jnp.maximum(-a, b), near, self.k)[0], low)
+        low = jnp.where(split, self._between(larger(-a, b), near, self.k)[0], low)
         return Interval.unchecked(low, jnp.where(split, INF, high))
 
     def derivative(self, a: Any, b: Any) -> Interval:

@@ -62,8 +62,6 @@ def identify(call: str, system: System, truth: bool) -> Evidence:
 def is_affine(observer: Observer) -> bool:
     """Are f and g affine in x wherever the state may be? Then every slack of a step is concave in the noise bounds."""
     system = observer.system
-    if not observer.first.affine_output:
-        return False
     u = observer.u_region if system.takes_u else Interval(np.zeros(system.m), np.zeros(system.m))
     jacobian = inclusion.jacobian(system.maps, "nearest")(system.state_bounds, u)
     return bool(np.array_equal(np.asarray(jacobian.lower), np.asarray(jacobian.upper)))

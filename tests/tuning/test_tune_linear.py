@@ -1,11 +1,13 @@
 """Fitted noise bounds on a linear plant: the optimum of the linear program of the whole recursion, and nothing less."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles.noise_program import smallest_noise
 
 import gsisio_jax as gx
 from gsisio_jax.tuning import Records, TunedNoise, tune_noise
+from gsisio_jax.tuning.identify import is_affine
 
 A = np.array([[1.0, 0.1], [0.0, 1.0]])
 WEIGHTS = {"w": [10.0, 3.0], "v": [5.0, 20.0]}
@@ -60,6 +62,16 @@ def test_costs_no_more_than_the_true_bounds(axis, fitted):
     noise = axis.observer.noise
     true = np.dot(WEIGHTS["w"], noise.w.width) + np.dot(WEIGHTS["v"], noise.v.width)
     assert fitted.start_cost == pytest.approx(true)
+
+
+def test_a_constant_in_the_outputs_is_still_a_linear_program(small):
+    def affine(f, g):
+        system = gx.System(f, g, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
+        return is_affine(gx.design_observer(system, small.noise, gx.Interval([-1.0], [1.0]), missing=False))
+
+    assert affine(lambda x: 0.9 * x, lambda x: x + 1)
+    assert not affine(lambda x: 0.9 * x, lambda x: x + 0.1 * jnp.sin(x))
+    assert not affine(lambda x: 0.9 * jnp.sin(x), lambda x: x)
 
 
 def test_held_out_records_are_counted(axis, fitted):
