@@ -104,18 +104,15 @@ def _share(a: Any, b: Any) -> Any:
     a, b = jax.lax.stop_gradient((a, b))
     size = jnp.abs(a) + jnp.abs(b)
     usual = (size > 0) & (size < jnp.inf)  # else both are 0, or one of them is infinite
-    part = jnp.where(usual, jnp.clip(0.5 * size + _steepness(a, b) * (b - a), 0, size), (a <= b).astype(size.dtype))
+    steepness = 64 / float(jnp.finfo(size.dtype).eps) ** 0.5
+    part = jnp.where(usual, jnp.clip(0.5 * size + steepness * (b - a), 0, size), (a <= b).astype(size.dtype))
     # The quotient comes last: XLA repeats cheap operations wherever their result is used, but no division. So all that
     # use this weight use the same number, even where a and b are 0 but for rounding.
     return part / jnp.where(usual, size, 1)
 
 
-def _steepness(*values: Any) -> float:
-    return 64 / float(jnp.finfo(jnp.result_type(*values)).eps) ** 0.5
-
-
 def _mix(share: Any, da: Any, db: Any) -> Any:
     # 1 but for rounding: a division here keeps XLA from repeating all that comes before in every fusion behind (twice
-    # as many operations in a gradient of the quadruple tank, and three times its compile time).
+    # as many operations in the compiled gradient of a single tank, and half as much compile time again).
     one = share + (1 - share)
     return (share * da + (1 - share) * db) / one
