@@ -21,32 +21,46 @@ import jax
 import jax.numpy as jnp
 
 
-@jax.custom_jvp
 def smaller(a: Any, b: Any) -> Any:
     """``jnp.minimum(a, b)``.
 
     >>> jax.grad(lambda t: smaller(2 * t, t + 1))(1.0).item()
     1.5
     """
-    return jnp.minimum(a, b)
+    return _smaller(*_alike(a, b))
 
 
-@smaller.defjvp
-def _smaller_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
-    (a, b), (da, db) = primals, tangents
-    return smaller(a, b), _mix(_share(a, b), da, db)
+def larger(a: Any, b: Any) -> Any:
+    """``jnp.maximum(a, b)``."""
+    return _larger(*_alike(a, b))
+
+
+def _alike(a: Any, b: Any) -> tuple[Any, Any]:
+    # In one type: an integer would have no derivative to weigh.
+    dtype = jnp.result_type(a, b)
+    return jnp.asarray(a, dtype), jnp.asarray(b, dtype)
 
 
 @jax.custom_jvp
-def larger(a: Any, b: Any) -> Any:
-    """``jnp.maximum(a, b)``."""
+def _smaller(a: Any, b: Any) -> Any:
+    return jnp.minimum(a, b)
+
+
+@_smaller.defjvp
+def _smaller_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+    (a, b), (da, db) = primals, tangents
+    return _smaller(a, b), _mix(_share(a, b), da, db)
+
+
+@jax.custom_jvp
+def _larger(a: Any, b: Any) -> Any:
     return jnp.maximum(a, b)
 
 
-@larger.defjvp
+@_larger.defjvp
 def _larger_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
     (a, b), (da, db) = primals, tangents
-    return larger(a, b), _mix(_share(b, a), da, db)
+    return _larger(a, b), _mix(_share(b, a), da, db)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -87,21 +101,18 @@ def _first(values: Any, slopes: Any) -> Any:
 
 def _share(a: Any, b: Any) -> Any:
     """Weight of the derivative of a in that of min(a, b): 1 where a is smaller, 0 where b is, 1/2 where they agree."""
-    a, b = jax.lax.stop_gradient((jnp.asarray(a), jnp.asarray(b)))
+    a, b = jax.lax.stop_gradient((a, b))
     size = jnp.abs(a) + jnp.abs(b)
     usual = (size > 0) & (size < jnp.inf)  # else both are 0, or one of them is infinite
-    part = jnp.where(usual, jnp.clip(0.5 * size + _steepness(a, b) * (b - a), 0, size), (a <= b).astype(size.dtype))
+    steepness = 64 / float(jnp.finfo(size.dtype).eps) ** 0.5
+    part = jnp.where(usual, jnp.clip(0.5 * size + steepness * (b - a), 0, size), (a <= b).astype(size.dtype))
     # The quotient comes last: XLA repeats cheap operations wherever their result is used, but no division. So all that
     # use this weight use the same number, even where a and b are 0 but for rounding.
     return part / jnp.where(usual, size, 1)
 
 
-def _steepness(*values: Any) -> float:
-    return 64 / float(jnp.finfo(jnp.result_type(*values)).eps) ** 0.5
-
-
 def _mix(share: Any, da: Any, db: Any) -> Any:
     # 1 but for rounding: a division here keeps XLA from repeating all that comes before in every fusion behind (twice
-    # as many operations in a gradient of the quadruple tank, and three times its compile time).
+    # as many operations in the compiled gradient of a single tank, and half as much compile time again).
     one = share + (1 - share)
     return (share * da + (1 - share) * db) / one

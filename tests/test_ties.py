@@ -44,6 +44,13 @@ def test_of_many(ours, plain, axis, dtype):
     np.testing.assert_array_equal(weights > 0, values == best)
 
 
+@pytest.mark.parametrize("zero", [0, 0.0, np.float32(0), np.zeros(1, int)])
+def test_constants_of_any_kind(zero):
+    assert float(jax.grad(lambda t: larger(t, zero).sum())(2.0)) == 1
+    assert float(jax.grad(lambda t: smaller(zero, t).sum())(2.0)) == 0
+    assert larger(jnp.float32(2), 0).dtype == jnp.float32
+
+
 def test_forward_and_second_order():
     def of(t):
         return larger(smaller(t**2, 2 * t), jnp.stack([t, 3 * t]).sum() - 3.0)
