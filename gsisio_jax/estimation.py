@@ -246,8 +246,7 @@ def _rows_from(noise: Noise, k: int) -> Noise:
 def _as_estimate(observer: AnyObserver, out: StepOutput) -> Estimate:
     return Estimate(
         out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows,
-        # What the gains of the prediction form leave of d by rounding is not bounded.
-        isinstance(observer, Observer) and observer.guaranteed,
+        observer.guaranteed,
     )  # fmt: skip
 
 
@@ -256,6 +255,14 @@ def check_on_conflict(call: str, on_conflict: str) -> bool:
     if on_conflict not in ("restart", "hold"):
         raise ValueError(f'{call}: `on_conflict` must be "restart" or "hold", got {on_conflict!r}')
     return on_conflict == "hold"
+
+
+def rounded(call: str, observer: AnyObserver, rounding: Rounding | None) -> AnyObserver:
+    """The observer with the rounding that a call asks for."""
+    if rounding is None:
+        return observer
+    check_rounding(call, rounding)
+    return observer if observer.rounding == rounding else observer.with_rounding(rounding)
 
 
 def _check_length(length: Any, rows: int) -> None:
@@ -276,9 +283,7 @@ def _prepare(
     rounding: Rounding | None = None,
 ) -> tuple[Interval, Any, Any, Noise, AnyObserver]:
     """Check shapes (and values of concrete arrays), and bring everything to one dtype, bounds rounded outward."""
-    if rounding is not None:
-        check_rounding(call, rounding)
-        observer = observer if observer.rounding == rounding else observer.with_rounding(rounding)
+    observer = rounded(call, observer, rounding)
     system = observer.system
     lead = "(T, " if rows else "("
     if not (isinstance(y, jax.Array | np.ndarray) and jnp.issubdtype(y.dtype, jnp.floating)):

@@ -7,6 +7,7 @@ Source: design 4.1, 4.3 and 6.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -56,7 +57,7 @@ class Slopes(eqx.Module):
 
 def slopes_on(system: Any, T2: Any, box: Interval, u_box: Interval, dtype: Any = np.float64) -> Slopes:
     """Enclose the Jacobians on a box, uniformly over `u_box`; computed in that type whatever JAX is set to."""
-    with jax.enable_x64(np.dtype(dtype) == np.float64):
+    with _able_to_hold(dtype):
         box, u_box = box.astype(dtype), u_box.astype(dtype)
         T2_array = jnp.asarray(np.asarray(T2), dtype)
         maps = (system.dynamics, system.measurement, lambda x, u: T2_array @ system.measurement(x, u))
@@ -64,6 +65,12 @@ def slopes_on(system: Any, T2: Any, box: Interval, u_box: Interval, dtype: Any =
         enclose = jax.jit(lambda box, u: [inclusion.jacobian(q)(box, u) for q in maps])
         parts = [_center_and_radius(jacobian) for jacobian in enclose(box, u_box)]
     return Slopes(*parts[0], *parts[1], *parts[2])
+
+
+def _able_to_hold(dtype: Any) -> Any:
+    """64-bit types are switched on where they are needed. They are never switched off: JAX keeps what it has traced of
+    an f with NumPy constants, and mistakes the one for the other when the setting changes to and fro."""
+    return jax.enable_x64(True) if np.dtype(dtype) == np.float64 else nullcontext()
 
 
 def _center_and_radius(jacobian: Interval) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +87,7 @@ def first_form(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64
 
     Source: design 4.3, step 3.
     """
-    with jax.enable_x64(np.dtype(dtype) == np.float64):
+    with _able_to_hold(dtype):
         matrix = jnp.asarray(np.asarray(T2), dtype)
         bounds, u_box = system.state_bounds.astype(dtype), u_region.astype(dtype)
         form, slack = jax.jit(affine_with_slack(lambda x, u: matrix @ system.measurement(x, u)))(bounds, u_box)

@@ -40,7 +40,7 @@ class PredictionObserver(eqx.Module):
         abstraction: affine planes of [f; g], where the bounds use them.
         derivative: bounds of the derivative of [f; g] that the decomposition uses, or None: enclosed on every box.
         current, current_input_directions: as in `Observer` (Lemma 4).
-        guaranteed: rho < 1, so the boxes are framers.
+        framer: rho < 1, so the boxes are framers.
         bounds: the methods of Corollary 1 in use.
     """
 
@@ -56,10 +56,15 @@ class PredictionObserver(eqx.Module):
     derivative: Interval | None
     current: Any
     current_input_directions: Any
-    guaranteed: bool = eqx.field(static=True)
+    framer: bool = eqx.field(static=True)
     bounds: tuple[str, ...] = eqx.field(static=True)
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())
     rounding: Rounding = eqx.field(static=True, default="outward")
+
+    @property
+    def guaranteed(self) -> bool:
+        """False: what J [G; H] leaves of the identity by rounding is not bounded in this form, and d has no bound."""
+        return False
 
     def with_rounding(self, rounding: Rounding) -> PredictionObserver:
         """The same observer with another rounding."""
@@ -119,7 +124,7 @@ def _finish(
     """Meet with what is known anyway (where the boxes are framers), and report."""
     system, certificate = observer.system, observer.certificate
     evidence = Evidence(x, magnitude(y, x.lower, x.upper))
-    if observer.guaranteed:
+    if observer.framer:
         # In exact arithmetic these are never crossed; sorting undoes rounding.
         evidence = Evidence(system.state_bounds, evidence.scale).meet(_sorted(x)[None], Source.STATE)
         d, slack = intersect(system.input_bounds, _sorted(d))

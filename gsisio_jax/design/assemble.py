@@ -14,7 +14,7 @@ from gsisio_jax.design.enclosures import Slopes
 from gsisio_jax.design.feedthrough import Feedthrough
 from gsisio_jax.design.inputs import InputBounds
 from gsisio_jax.design.planes import plane_bounds
-from gsisio_jax.design.problem import GainProblem, without_rounding
+from gsisio_jax.design.problem import GainProblem, beyond_rounding, without_rounding
 from gsisio_jax.guard import with_output
 from gsisio_jax.inclusion.abstraction import Abstraction
 from gsisio_jax.interval import Interval
@@ -37,12 +37,12 @@ class Plan:
         bounded = np.isfinite(state_width)
         return GainProblem(
             F=slopes.F,
-            F_radius=_beyond_rounding(slopes.F_radius, slopes.F),
+            F_radius=beyond_rounding(slopes.F_radius, slopes.F),
             E=slopes.E,
-            E_radius=_beyond_rounding(slopes.E_radius, slopes.E),
+            E_radius=beyond_rounding(slopes.E_radius, slopes.E),
             T2=self.feedthrough.T2,
             C=np.vstack([slopes.Z, np.eye(system.n)[bounded]]),
-            R=_beyond_rounding(slopes.Z_radius, slopes.Z),
+            R=beyond_rounding(slopes.Z_radius, slopes.Z),
             G=np.asarray(system.G),
             H=np.asarray(system.H),
             free=~np.isfinite(input_width),
@@ -51,12 +51,6 @@ class Plan:
             ds=state_width[bounded],
             dd=input_width[np.isfinite(input_width)],
         )
-
-
-def _beyond_rounding(radius: np.ndarray, center: np.ndarray) -> np.ndarray:
-    """Radii of enclosures without those that only rounding gave a width: for the program that looks for gains, and for
-    the widths that it expects. What the observer runs with has them."""
-    return np.where(radius <= 1e-13 * np.abs(center).max(initial=1.0), 0.0, radius)
 
 
 def assemble(

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsisio_jax.design.enclosures import Slopes
 from gsisio_jax.design.feedthrough import Feedthrough
-from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.design.problem import GainProblem, beyond_rounding
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.system import System
 
@@ -30,8 +30,8 @@ def check_existence(system: System, feedthrough: Feedthrough, everywhere: Slopes
     G = system.G
     bounded_inputs = np.isfinite(np.asarray(system.input_bounds.width))
     bounded_states = np.isfinite(np.asarray(system.state_bounds.width))
-    # T2 g is certainly constant along G v if it is affine in every state that G v moves and has no slope there.
-    nonlinear_states = (everywhere.Z_radius > 0).any(axis=0)
+    # T2 g is constant along G v if it is affine in every state that G v moves, to rounding, and has no slope there.
+    nonlinear_states = (beyond_rounding(everywhere.Z_radius, everywhere.Z) > 0).any(axis=0)
     conditions = [
         _rows(system.H),
         _rows(np.where(nonlinear_states, 0.0, everywhere.Z) @ G),

@@ -72,7 +72,7 @@ def design_prediction(
         derivative=derivative,
         current=feedthrough.current,
         current_input_directions=feedthrough.V1,
-        guaranteed=gains.guaranteed,
+        framer=gains.guaranteed,
         bounds=bounds,
         output_rows=feedthrough.output_rows,
     )

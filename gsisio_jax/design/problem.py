@@ -170,3 +170,9 @@ def steady_state(growth: np.ndarray, noise_width: np.ndarray) -> np.ndarray:
 def without_rounding(matrix: np.ndarray) -> np.ndarray:
     """Zero where only rounding is left: a stray 1e-17 times an unbounded box would be unbounded."""
     return np.where(np.abs(matrix) < 1e-13 * np.abs(matrix).max(initial=0.0), 0.0, matrix)
+
+
+def beyond_rounding(radius: np.ndarray, center: np.ndarray) -> np.ndarray:
+    """Radii of enclosures without those that only rounding gave a width: for the program that looks for gains, and for
+    the widths that it expects. What the observer runs with has them."""
+    return np.where(radius <= 1e-13 * np.abs(center).max(initial=1.0), 0.0, radius)

@@ -14,7 +14,7 @@ from gsisio_jax import rounding
 from gsisio_jax.inclusion.boxes import added_slack, moderate, product, scaled_slack, shift, stretch, sum_slack, times
 from gsisio_jax.inclusion.curves import CURVES, RECIPROCAL, SQUARE, power
 from gsisio_jax.inclusion.linear import add, move, multiple, structural, total
-from gsisio_jax.inclusion.node import Node, as_node, best_form, is_node, join, meet, parts, settled, slope_of
+from gsisio_jax.inclusion.node import Node, as_node, best_form, chain, is_node, join, meet, parts, settled, slope_of
 from gsisio_jax.inclusion.univariate import apply, extremes
 from gsisio_jax.interval import Interval, choose, entire_like, is_concrete
 
@@ -37,9 +37,7 @@ def multiply(x: Any, y: Any) -> Node:
         cx, cy = jnp.where(tame, cx, 0), jnp.where(tame, cy, 0)
         spread = jnp.where(tame, times(_radius(x.range, cx), _radius(y.range, cy)), jnp.inf)
         form = _envelope(x, y, cx, cy, spread, natural, box)
-    jac_x = None if x.jac is None else product(y.range, x.jac)
-    jac_y = None if y.jac is None else product(x.range, y.jac)
-    node = Node(natural, form, join(jac_x, jac_y))
+    node = Node(natural, form, join(chain(y.range, x.jac), chain(x.range, y.jac)))
     return meet(node) if x.form is not None and y.form is not None else node
 
 
@@ -225,9 +223,8 @@ def angle(y: Any, x: Any) -> Node:
         return Node(natural, form)
     over_y = _pull(x.range, y.range, smooth)
     over_x = _pull(y.range, x.range, smooth)
-    jac_y = None if y.jac is None else product(over_y, y.jac)
-    jac_x = None if x.jac is None else product(Interval.unchecked(-over_x.upper, -over_x.lower), x.jac)
-    return Node(natural, form, join(jac_y, jac_x))
+    jac_x = chain(Interval.unchecked(-over_x.upper, -over_x.lower), x.jac)
+    return Node(natural, form, join(chain(over_y, y.jac), jac_x))
 
 
 def _safe_root(edge: Any, slope: Any) -> Any:

@@ -41,6 +41,7 @@ from gsisio_jax.inclusion.node import (
     settled,
     slack_of,
     slope_of,
+    sparse,
     unsettled,
 )
 from gsisio_jax.interval import Interval, is_concrete
@@ -102,7 +103,11 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
     ranges = ranges or [None] * len(forms)
     jacs: list[Any] = [None] * len(forms)
     if jac is not None:
-        jacs = both([jac_of(v, jac.lower.shape[0]) for v in nodes], along)
+        parts_of = [jac_of(v, jac.lower.shape[0]) for v in nodes]
+        jacs = both(parts_of, along)
+        if adds:
+            entering = run(along, *(((v.lower != 0) | (v.upper != 0)).astype(dtype) for v in parts_of))
+            jacs = [sparse(found, Interval.unchecked(entering, entering)) for found in jacs]
     raw = rounding.outward() and (adds or any(v.raw for v in nodes))
     return [Node(*triple, raw) for triple in zip(ranges, forms, jacs, strict=True)]
 
@@ -136,19 +141,19 @@ def multiple(factor: Any, x: Node, rounded: bool = False) -> Node:
         # Compiled code would take it for zero: a thin box, without form.
         thin = as_node(factor, np.broadcast_shapes(np.shape(factor), x.shape), x.dtype).range
         x = settled(x)
-        return Node(product(thin, x.range), None, None if x.jac is None else product(thin, x.jac))
+        return Node(product(thin, x.range), None, chain(thin, x.jac))
     ulps = 4.0 if rounded else 2.0
     if not (is_known(factor) and np.isfinite(factor).all()):
         x = settled(x)  # 0 times NaN would count as 0
-    form = x.form
+    form, jac = x.form, None if x.jac is None else sparse(stretch(factor, x.jac, ulps), x.jac)
     if form is not None:
         slope = factor * form.slope
         slack = scaled_slack(factor, form.slope, slope, form.slack, ulps)
         form = Form(slope, stretch(factor, form.offset, ulps), form.box, slack)
         if form.is_told():
-            return unsettled(None, form, None if x.jac is None else stretch(factor, x.jac, ulps))
+            return unsettled(None, form, jac)
         form = None if THIN.get() else form
-    return unsettled(stretch(factor, x.range, ulps), form, None if x.jac is None else stretch(factor, x.jac, ulps))
+    return unsettled(stretch(factor, x.range, ulps), form, jac)
 
 
 def negative(x: Node) -> Node:

@@ -295,11 +295,23 @@ def jac_of(node: Node, size: int) -> Interval:
 
 def chain(derivative: Interval, jac: Interval | None) -> Interval | None:
     """Derivative of an elementwise function times the Jacobian of its argument."""
-    return None if jac is None else product(derivative, jac)
+    return None if jac is None else sparse(product(derivative, jac), jac)
+
+
+def sparse(jac: Interval, *factors: Interval) -> Interval:
+    """The Jacobian, exactly 0 where all factors are: a variable that does not enter may be unbounded, and the least
+    that widening adds to a zero would make everything of it."""
+    if not rounding.outward() or is_known(jac.lower):
+        return jac
+    zero = None
+    for factor in factors:
+        now = (factor.lower == 0) & (factor.upper == 0)
+        zero = now if zero is None else zero & now
+    return choose(zero, Interval.unchecked(0, 0), jac)
 
 
 def join(a: Interval | None, b: Interval | None) -> Interval | None:
     """Sum of two Jacobians, absent ones being zero."""
     if a is None or b is None:
         return b if a is None else a
-    return shift(a, b)
+    return sparse(shift(a, b), a, b)

@@ -97,18 +97,34 @@ def _convert(eqn: Any, x: Node) -> Node:
     """Between floating types the bounds follow; an integer is carried as the floating number it is."""
     target = eqn.params["new_dtype"]
     if jnp.issubdtype(target, jnp.floating):
-        if jnp.issubdtype(x.dtype, jnp.floating) and jnp.finfo(target).bits < jnp.finfo(x.dtype).bits:
-            # Bounds are those of the number before it is rounded to the narrower type, as for every other operation.
-            x = settled(x)
-            narrow = x.range.astype(target)
-            jac = None if x.jac is None else x.jac.astype(target)
-            return Node(narrow, None, jac)
-        return linear.move(lambda v: v.astype(target), x)
+        return _to_floating(x, target)
     if x.dtype == jnp.bool_:
         return x if target == jnp.bool_ else linear.move(lambda v: v.astype(jnp.result_type(float)), x)
     if target == jnp.bool_:
         return logic.invert(logic.equal(x, jnp.zeros(x.shape, x.dtype)))
     return x if jnp.issubdtype(eqn.invars[0].aval.dtype, jnp.integer) else logic.truncate(x)
+
+
+def _to_floating(x: Any, target: Any) -> Any:
+    """A node or a constant in that floating type."""
+    if is_node(x) and jnp.issubdtype(x.dtype, jnp.floating) and jnp.finfo(target).bits < jnp.finfo(x.dtype).bits:
+        # Bounds are those of the number before it is rounded to the narrower type, as for every other operation.
+        x = settled(x)
+        narrow = x.range.astype(target)
+        jac = None if x.jac is None else x.jac.astype(target)
+        return Node(narrow, None, jac)
+    return linear.move(lambda v: v.astype(target), x)
+
+
+def _dot(eqn: Any, x: Any, y: Any) -> Any:
+    """Unlike all others, this primitive takes factors of several types: a matrix of float64 times an x of float32."""
+    types = [atom.aval.dtype for atom in (*eqn.invars, *eqn.outvars)]
+    floating = all(jnp.issubdtype(dtype, jnp.floating) for dtype in types)
+    if floating and len(set(types)) > 1:
+        wide = jnp.result_type(*types)
+        x, y = (_to_floating(v, wide) for v in (x, y))
+    out = bilinear.dot(x, y, eqn.params["dimension_numbers"], _same(eqn))
+    return _to_floating(out, types[-1]) if floating and out.dtype != types[-1] else out
 
 
 def _div(eqn: Any, x: Any, y: Any) -> Node:
@@ -189,7 +205,7 @@ ELEMENTWISE: dict[str, Rule] = {
 }
 # Across entries.
 REDUCTIONS: dict[str, Rule] = {
-    "dot_general": lambda eqn, x, y: bilinear.dot(x, y, eqn.params["dimension_numbers"], _same(eqn)),
+    "dot_general": _dot,
     "reduce_sum": lambda eqn, x: linear.total(x, eqn.params["axes"]),
     "reduce_max": _reduce(logic.maximum),
     "reduce_min": _reduce(logic.minimum),

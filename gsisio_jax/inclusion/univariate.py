@@ -32,9 +32,9 @@ import numpy as np
 
 from gsisio_jax import rounding
 from gsisio_jax.fusion import once
-from gsisio_jax.inclusion.boxes import guard, product, scaled_slack, slope_reach, times
+from gsisio_jax.inclusion.boxes import guard, scaled_slack, slope_reach, times
 from gsisio_jax.inclusion.elementary import LIMIT
-from gsisio_jax.inclusion.node import THIN, Node, best_form, settled
+from gsisio_jax.inclusion.node import THIN, Node, best_form, chain, settled
 from gsisio_jax.inclusion.waves import Wave, crosses
 from gsisio_jax.interval import Interval, choose, entire_like, held
 from gsisio_jax.ties import larger, smaller
@@ -49,6 +49,8 @@ def apply(curve: Any, x: Node) -> Node:
     """Apply a function of one variable to a node, in all domains."""
     x = settled(x)
     a, b = x.range.lower, x.range.upper
+    if getattr(curve, "steep", False):
+        a, b = _calm(a), _calm(b)
     if isinstance(curve, Wave) and THIN.get():
         return Node(held(curve.near(a, b)))
     # What range, line and derivative of a wave have in common is computed once.
@@ -68,8 +70,13 @@ def apply(curve: Any, x: Node) -> Node:
             slack = scaled_slack(s, x.form.slope, slope, x.form.slack)
             size = slope_reach(slope, x.form.box)
         form = best_form(slope, held(Interval.unchecked(lower, upper)), natural, x.form.box, slack, size)
-    jac = None if x.jac is None else product(guard(curve.derivative(a, b, *shared)), x.jac)
-    return Node(natural, form, jac)
+    return Node(natural, form, None if x.jac is None else chain(guard(curve.derivative(a, b, *shared)), x.jac))
+
+
+def _calm(t: Any) -> Any:
+    """t, whose gradient next to 0 is 0, as it is at 0 itself: the derivative of a root is infinite there, and what
+    rounding makes of a zero would come back as NaN from a product of a few of those."""
+    return jnp.where(abs(t) < float(jnp.finfo(t.dtype).tiny) ** 0.25, jax.lax.stop_gradient(t), t)
 
 
 def extremes(values: list[Any]) -> Interval:
@@ -191,6 +198,11 @@ class Curve:
         return max(self.phi.ulps, self.slope.ulps)
 
     @property
+    def steep(self) -> bool:
+        """Has an infinite value or derivative at 0."""
+        return self.phi.domain[0] == 0 or abs(self.slope.turn) == INF
+
+    @property
     def drifts(self) -> bool:
         return self.phi.drift is not None or self.slope.drift is not None
 
@@ -287,6 +299,7 @@ class Pole:
     """``t ** -k`` for a positive integer k."""
 
     k: int
+    steep = True
 
     def _side(self, a: Any, b: Any) -> tuple[Any, Any, Any, Any]:
         """Is 0 strictly inside (or all there is, as after a subnormal number was flushed), are we on the left of 0, and

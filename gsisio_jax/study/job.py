@@ -190,6 +190,7 @@ def run(
     attributes = {
         "title": title,
         "certificate": str(observer.certificate),
+        "guaranteed": observer.guaranteed,
         "steps": labels.steps,
         "tile": job.size,
         "library": f"gsisio_jax {gsisio_jax.__version__}, jax {jax.__version__}",

@@ -172,7 +172,7 @@ def fingerprint(
     system = observer.system
     maps = jax.make_jaxpr(system.maps)(np.zeros(system.n), np.zeros(system.m))
     names = [repr(r) if is_dataclass(r) else f"{type(r).__qualname__} {r.name}" for r in reductions]
-    static = (getattr(observer, name, None) for name in ("bounds", "sweeps", "output_rows", "guaranteed"))
+    static = (getattr(observer, name, None) for name in ("bounds", "sweeps", "output_rows", "framer", "rounding"))
     text, constants = source.identity(observer)
     digest = hashlib.sha256(repr((jax.__version__, str(maps.jaxpr), text, names, *static, *rest)).encode())
     # f and g make the structure of the observer's pytree differ between processes, but not its leaves.

@@ -13,6 +13,7 @@ from gsisio_jax import estimation
 from gsisio_jax._extras import need
 from gsisio_jax.estimation import AnyObserver, OnConflict
 from gsisio_jax.interval import Interval
+from gsisio_jax.rounding import Rounding
 from gsisio_jax.study.axes import RUN, Axis, Layout, prepare
 from gsisio_jax.study.containment import Containment, TrueRun
 from gsisio_jax.study.job import Job, run
@@ -60,6 +61,7 @@ def monte_carlo(
     input_units: Sequence[str] | None = None,
     time: Any = None,
     title: str = "",
+    rounding: Rounding | None = None,
 ) -> Any:
     """Simulate many runs of the plant, estimate each as it goes, and check that the boxes hold the truth at every step.
 
@@ -105,6 +107,7 @@ def monte_carlo(
     Source: design 2, 7 and 11.
     """
     need("xarray", extra="study", purpose="a Monte Carlo study")
+    observer = estimation.rounded(CALL, observer, rounding)
     hold = estimation.check_on_conflict(CALL, on_conflict)
     if on_miss not in ("raise", "record"):
         raise ValueError(f'{CALL}: `on_miss` must be "raise" or "record", got {on_miss!r}')

@@ -9,6 +9,7 @@ from gsisio_jax import estimation
 from gsisio_jax._extras import need
 from gsisio_jax.estimation import AnyObserver, OnConflict
 from gsisio_jax.interval import Interval
+from gsisio_jax.rounding import Rounding
 from gsisio_jax.study.axes import Axis, Layout, bare, prepare
 from gsisio_jax.study.job import Job, run
 from gsisio_jax.study.labels import Labels
@@ -42,6 +43,7 @@ def sweep(
     input_units: Sequence[str] | None = None,
     time: Any = None,
     title: str = "",
+    rounding: Rounding | None = None,
 ) -> Any:
     """Run an observer on every combination of what varies, in one compiled program, and keep what `reduce` says.
 
@@ -73,6 +75,7 @@ def sweep(
         state_units: n units. Likewise `input_units`.
         time: (T,) seconds, labels of the rows for ``reduce=None``; the step number where left out.
         title: attribute ``title``.
+        rounding: as in `estimate`; attribute ``guaranteed`` says whether the boxes hold on the machine.
 
     Returns:
         ``xarray.Dataset`` with the named axes as first dimensions, then "state", "input", "time". Beside the measured
@@ -87,6 +90,7 @@ def sweep(
     Source: design 4.4 and 7.
     """
     need("xarray", extra="study", purpose="a sweep")
+    observer = estimation.rounded(CALL, observer, rounding)
     reductions = resolve(CALL, reduce, truth is not None)
     hold = estimation.check_on_conflict(CALL, on_conflict)
     given = {

@@ -301,7 +301,7 @@ def test_gradients_and_types():
     small = planes.astype(np.float32)
     bounds = small.over(Interval(np.array([1.25], np.float32), np.array([2.75], np.float32)))
     assert small.gap.dtype == bounds.dtype == np.float32
-    assert (bounds.lower[0], bounds.upper[0]) == pytest.approx((1.5, 7.75))
+    assert (bounds.lower[0], bounds.upper[0]) == pytest.approx((1.5, 7.75), rel=1e-5)
 
 
 def test_regions_without_width():

@@ -26,10 +26,11 @@ def test_invisible_direction_is_proved_and_named():
     assert "input_bounds" in str(error.value)
 
 
-def test_invisible_direction_of_a_nonlinear_plant():
-    """y = sin(x1) + x2 never sees the input that moves x3."""
+@pytest.mark.parametrize(("weight", "moved"), [(0.0, [[0.0], [0.0], [2.0]]), (0.3, [[0.0], [0.3], [-1.0]])])
+def test_invisible_direction_of_a_nonlinear_plant(weight, moved):
+    """y = sin(x1) + x2 + a x3 never sees an input that moves x2 and x3 as -a to 1."""
     with pytest.raises(gx.ObserverDoesNotExist) as error:
-        design(lambda x: 0.5 * jnp.tanh(x), lambda x: jnp.stack([jnp.sin(x[0]) + x[1]]), [[0.0], [0.0], [2.0]], [[0.0]])
+        design(lambda x: 0.5 * jnp.tanh(x), lambda x: jnp.stack([jnp.sin(x[0]) + x[1] + weight * x[2]]), moved, [[0.0]])
     assert "(1)" in str(error.value)
 
 

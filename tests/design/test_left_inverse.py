@@ -138,7 +138,7 @@ def test_printed_box_is_not_tight_for_a_tall_matrix():
     assert hull is not None
     np.testing.assert_allclose(hull, [[0.0], [1.0]], atol=1e-15)
     box = exact_input_box(jnp.asarray(basic_left_inverses(S).rows), Interval(low, high))
-    np.testing.assert_array_equal([box.lower, box.upper], [[0.0], [1.0]])
+    np.testing.assert_allclose([box.lower, box.upper], [[0.0], [1.0]], atol=1e-14)
 
 
 def test_every_row_is_a_left_inverse_on_independent_rows_and_none_comes_twice():

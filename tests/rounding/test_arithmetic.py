@@ -139,3 +139,16 @@ def test_inverses_are_proved():
     assert upper_inverse(np.array([[1.0]])) is None
     # What does not see each other stays apart.
     assert upper_inverse(np.diag([0.5, 0.25]))[0, 1] == 0
+
+
+def test_what_does_not_enter_has_no_derivative_at_all():
+    """Widening leaves a zero of the Jacobian alone: times an unbounded variable it must stay 0."""
+    box = Interval([-1.0, 0.5, -np.inf], [1.0, 2.0, np.inf])
+
+    def f(x):
+        return jnp.stack([jnp.sin(x[0]) * x[1] + 0.3 * jnp.exp(x[1]) / 49, jnp.sum(jnp.tanh(x[:2])), x[0] / x[1]])
+
+    slopes = inclusion.jacobian(f)(box)
+    assert not np.asarray(slopes.lower)[:, 2].any()
+    assert not np.asarray(slopes.upper)[:, 2].any()
+    assert np.isfinite(inclusion.mean_value(f)(box).width).all()

@@ -161,12 +161,17 @@ def test_a_summary_with_numbers_missing_infinite_or_alone():
 
 
 def test_a_miss_ends_the_study_and_names_the_run(observer):
-    """An observer that takes an output for free of the unknown input which is not."""
-    false = eqx.tree_at(lambda o: o.T2, observer, observer.T2 + 1.0)
+    """An observer that takes an output for free of the unknown input which is not. Rounded to nearest: marked so."""
+    T2, banks = observer.T2 + 1.0, (observer.gains, observer.inverses)
+    false = eqx.tree_at(
+        lambda o: (o.T2, o.gains.output, o.inverses.output),
+        observer.with_rounding("nearest"), (T2, *(bank.remainder @ T2 for bank in banks)),
+    )  # fmt: skip
     with pytest.raises(gx.ContainmentLost) as raised:
         carlo(false, runs=[3, 9])
     message = str(raised.value)
     recorded = carlo(false, runs=[3, 9], on_miss="record")
+    assert recorded.attrs["guaranteed"] is False
     missed = recorded.first_miss.dropna("run")
     number, step = int(missed.run[0]), int(missed[0])
     assert f"in run {number} at step {step}" in message

@@ -324,6 +324,18 @@ def test_one_case_in_single_precision(plain):
     assert result.attrs["title"] == "two"
 
 
+def test_rounding_to_nearest_is_marked_and_narrower(plain, whole):
+    given = {key: value for key, value in plain.items() if key != "observer"}
+    near = gx.sweep(plain["observer"], **given, reduce=("max",), rounding="nearest")
+    assert whole.attrs["guaranteed"] is True
+    assert near.attrs["guaranteed"] is False
+    wider = whole.state_width_max - near.state_width_max
+    assert (wider > 0).all()
+    assert (wider < 1e-12 * whole.state_width_max).all()
+    with pytest.raises(ValueError, match="sweep: `rounding` must be"):
+        gx.sweep(plain["observer"], **given, rounding="up")
+
+
 def test_reductions_of_ones_own(whole):
     assert whole.lowest.dims == ("run",)
     assert whole.lowest.attrs["units"] == "m"
