@@ -274,7 +274,8 @@ def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box:
         size, n = sum(C.shape) + 4.0, C.shape[1] + 2.0 * C.shape[0]
         # Residual of B, with what its own evaluation loses, and that of D: |D| far is at hand as a vector.
         thrown = _reached(D, far)
-        of_inverse = defect + rounding.error(multiplied(B, jnp.eye(C.shape[0], dtype=D.dtype) + multiplied(D, N)), size)
+        taken = multiplied(B, jnp.eye(C.shape[0], dtype=D.dtype) + multiplied(D, N))
+        of_inverse = defect + rounding.error(taken, size, 2 * size)
         radius = _reached(N, _reached(of_inverse, thrown))
         # Rounding of M = I - N_z B D, which meets A x, and of D in both: (I + |N||B||D|) (far + |N||D| far).
         image_of_x = far + _reached(N, thrown)
@@ -285,8 +286,9 @@ def solve_remainder(gains: Bank, right: Interval, form: AffineForm, C: Any, box:
 
 
 def _reached(matrix: Any, reach: Any) -> Any:
-    """`spread` to nearest."""
-    return add_up(scale(matrix, reach[..., None, :]))
+    """`spread` to nearest, of nonnegative factors, with what its products lose where they are flushed to zero."""
+    flushed = 2.0 * matrix.shape[-1] * float(jnp.finfo(matrix.dtype).tiny)
+    return add_up(scale(matrix, reach[..., None, :])) + flushed
 
 
 def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:

@@ -1,5 +1,17 @@
 """The reference results are double precision; float32 is tested by float32 inputs."""
 
+import gc
+from collections.abc import Iterator
+
 import jax
+import pytest
 
 jax.config.update("jax_enable_x64", True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def little_memory() -> Iterator[None]:
+    """No module needs the programs of another one; kept, they take gigabytes, and ever longer collections."""
+    yield
+    jax.clear_caches()
+    gc.collect()

@@ -31,6 +31,8 @@ class Case:
     u_region: Interval | None = None
 
     def design(self, **options: Any) -> gx.Observer:
+        """With one contraction per step, unless `options` say otherwise: compiling takes most of the time of a test."""
+        options = {"sweeps": 1} | options
         return gx.design_observer(self.system, self.noise, self.region, u_region=self.u_region, **options)
 
     def simulate(self, key: Any, noise: gx.Noise | None = None, d_scale: Any = 1.0) -> tuple[gx.Simulation, Any]:

@@ -89,7 +89,9 @@ def design() -> Target:
     )
     noise = gx.Noise(Interval.symmetric(PROCESS_NOISE), Interval.symmetric([POSITION_NOISE, VELOCITY_NOISE]))
     return Target(
-        gx.design_observer(system, noise, Interval.entire(2)), Interval([-10.0, -SPEED], [10.0, SPEED]), bounds
+        gx.design_observer(system, noise, Interval.entire(2), sweeps=1),
+        Interval([-10.0, -SPEED], [10.0, SPEED]),
+        bounds,
     )
 
 

@@ -51,7 +51,8 @@ class Wave:
         return _wave_range(self.cosine, 1.0, parts or self.parts(a, b))
 
     def near(self, a: Any, b: Any) -> Interval:
-        """Bounds that are as good as `range` on thin boxes: no value is farther from that in the middle than r."""
+        """As good as `range` on thin boxes: slopes are at most 1, so no value is farther than r from that
+        in the middle. What m, r and that value lose is part of what `_wave_padded` counts."""
         usable, m, r = _middle(a, b)
         value, radius = sin_cos(m)[self.cosine], r
         if rounding.outward():

@@ -73,12 +73,12 @@ def simulate_unseen(seed, bound):
 @pytest.fixture(scope="module")
 def bounded():
     """One observer; its bounds are numbers of the pytree and may change from run to run."""
-    return gx.design_observer(unseen(2.0), UNSEEN_NOISE, Interval.entire(2), missing=False)
+    return gx.design_observer(unseen(2.0), UNSEEN_NOISE, Interval.entire(2), missing=False, sweeps=1)
 
 
 def test_input_bounds_make_an_invisible_input_bearable(bounded):
     with pytest.raises(gx.ObserverDoesNotExist, match="input_bounds"):
-        gx.design_observer(unseen(None), UNSEEN_NOISE, Interval.entire(2))
+        gx.design_observer(unseen(None), UNSEEN_NOISE, Interval.entire(2), sweeps=1)
     x, y, d = simulate_unseen(0, 2.0)
     est = run(bounded, Interval.symmetric([1.0, 1.0]), y)
     assert est.state.contains(x, -ROUNDING).all()
@@ -90,7 +90,7 @@ def test_input_bounds_make_an_invisible_input_bearable(bounded):
 
 
 def test_tighter_input_bounds_give_narrower_boxes(bounded):
-    tight = gx.design_observer(unseen(0.5), UNSEEN_NOISE, Interval.entire(2), missing=False)
+    tight = gx.design_observer(unseen(0.5), UNSEEN_NOISE, Interval.entire(2), missing=False, sweeps=1)
     assert tight.certificate.steady_width[1] < bounded.certificate.steady_width[1]
     x, y, d = simulate_unseen(1, 0.5)
     narrow = run(tight, Interval.symmetric([1.0, 1.0]), y)
@@ -158,7 +158,9 @@ KNOWN_NOISE = gx.Noise(Interval([-0.05, 0.0], [0.05, 0.1]), Interval([-0.1, -0.2
 @pytest.fixture(scope="module")
 def known():
     u_region = Interval([-0.3, -1.0], [0.3, 1.0])
-    return gx.design_observer(KNOWN, KNOWN_NOISE, Interval.symmetric([3.0, 3.0]), missing=False, u_region=u_region)
+    return gx.design_observer(
+        KNOWN, KNOWN_NOISE, Interval.symmetric([3.0, 3.0]), missing=False, sweeps=1, u_region=u_region
+    )
 
 
 def drive(scale=1.0):

@@ -30,7 +30,7 @@ def test_a_constant_in_an_affine_output_moves_no_box(region):
     plain, moved = plant(g), plant(lambda x: g(x) + constant)
     run = gx.simulate(plain, jax.random.key(0), np.zeros(2), np.ones((STEPS, 1)), NOISE)
     found = [
-        gx.estimate(gx.design_observer(system, NOISE, region, missing=False), systems.ball([1.0, 1.0]), y)
+        gx.estimate(gx.design_observer(system, NOISE, region, missing=False, sweeps=1), systems.ball([1.0, 1.0]), y)
         for system, y in ((plain, run.y), (moved, run.y + constant))
     ]
     for est in found:
@@ -45,8 +45,10 @@ def test_a_known_input_in_an_affine_output_moves_no_box():
     plain, moved = plant(g), plant(lambda x, u: g(x) + 3 * u, m=1)
     run = gx.simulate(plain, jax.random.key(0), np.zeros(2), np.ones((STEPS, 1)), NOISE)
     region = systems.ball([3.0, 3.0])
-    one = gx.estimate(gx.design_observer(plain, NOISE, region, missing=False), systems.ball([1.0, 1.0]), run.y)
-    observer = gx.design_observer(moved, NOISE, region, u_region=gx.Interval([-1.0], [1.0]), missing=False)
+    one = gx.estimate(
+        gx.design_observer(plain, NOISE, region, missing=False, sweeps=1), systems.ball([1.0, 1.0]), run.y
+    )
+    observer = gx.design_observer(moved, NOISE, region, u_region=gx.Interval([-1.0], [1.0]), missing=False, sweeps=1)
     other = gx.estimate(observer, systems.ball([1.0, 1.0]), run.y + 3 * u, u)
     assert (other.status == gx.Status.OK).all()
     for a, b in zip(*(jax.tree.leaves((est.state, est.input)) for est in (one, other)), strict=True):

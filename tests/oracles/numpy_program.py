@@ -40,7 +40,7 @@ def _run(jaxpr: Any, consts: list[Any], args: list[Any]) -> list[Any]:
         inner = p.get("call_jaxpr", p.get("jaxpr"))
         if inner is not None:  # jit, custom_jvp_call, ...
             outputs = _run(inner.jaxpr, [np.asarray(c) for c in inner.consts], inputs)
-        elif name == "optimization_barrier":
+        elif name in ("optimization_barrier", "once"):
             outputs = inputs
         elif name in _ELEMENTWISE:
             outputs = [_ELEMENTWISE[name](*inputs)]

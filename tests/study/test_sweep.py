@@ -55,7 +55,7 @@ def study() -> Study:
     case = replace(systems.s1(), steps=T)
     plant = case.system
     bounded = gx.System(plant.f, plant.g, plant.G, plant.H, state_bounds=systems.ball([6.0, 6.0]))
-    observer = replace(case, system=bounded).design(missing=False, sweeps=1)
+    observer = replace(case, system=bounded).design(missing=False).with_rounding("nearest")
     runs, d = jax.vmap(case.simulate)(jax.random.split(jax.random.key(3), RECORDS))
     y = np.array(runs.y)
     y[1, 7] += [10.0, 40.0]
@@ -234,7 +234,7 @@ def plain(linear) -> dict[str, Any]:
     """Eleven boxes on one record."""
     record, _ = linear.simulate(jax.random.key(0))
     radius = np.linspace(0.5, 5, 11)[:, None] * np.ones(2)
-    observer = linear.design(missing=False, sweeps=1)
+    observer = linear.design(missing=False)
     return {
         "observer": observer,
         "initial": gx.Interval.symmetric(radius),
