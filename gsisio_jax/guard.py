@@ -7,6 +7,7 @@ Source: design 4.1, 4.3 and 6.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
@@ -55,16 +56,23 @@ class Slopes(eqx.Module):
         return self.near_affine(self.F_radius, self.E_radius, self.Z_radius)
 
 
-def slopes_on(system: Any, T2: Any, box: Interval, u_box: Interval, dtype: Any = np.float64) -> Slopes:
-    """Enclose the Jacobians on a box, uniformly over `u_box`; computed in that type whatever JAX is set to."""
-    with _able_to_hold(dtype):
-        box, u_box = box.astype(dtype), u_box.astype(dtype)
+def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) -> Callable[[Interval], Slopes]:
+    """Enclosures of the Jacobians as a function of the box, uniformly over `u_box`; compiled once for all boxes, and
+    computed in that type whatever JAX is set to."""
+
+    # Compiled as one program: eager interval arithmetic would pay for every primitive apart.
+    @jax.jit
+    def enclose(box: Interval, u: Interval) -> list[Interval]:
         T2_array = jnp.asarray(np.asarray(T2), dtype)
         maps = (system.dynamics, system.measurement, lambda x, u: T2_array @ system.measurement(x, u))
-        # Compiled as one program: eager interval arithmetic would pay for every primitive apart.
-        enclose = jax.jit(lambda box, u: [inclusion.jacobian(q)(box, u) for q in maps])
-        parts = [_center_and_radius(jacobian) for jacobian in enclose(box, u_box)]
-    return Slopes(*parts[0], *parts[1], *parts[2])
+        return [inclusion.jacobian(q)(box, u) for q in maps]
+
+    def on(box: Interval) -> Slopes:
+        with _able_to_hold(dtype):
+            parts = [_center_and_radius(jacobian) for jacobian in enclose(box.astype(dtype), u_box.astype(dtype))]
+        return Slopes(*parts[0], *parts[1], *parts[2])
+
+    return on
 
 
 def _able_to_hold(dtype: Any) -> Any:
@@ -116,9 +124,7 @@ def single_precision(observer: Observer) -> Observer:
     system = observer.system
     u_region = observer.u_region if system.takes_u else Interval(np.zeros(system.m), np.zeros(system.m))
 
-    def slopes(box: Interval) -> Slopes:
-        return slopes_on(system, narrow.T2, box, u_region, np.float32)
-
+    slopes = slopes_of(system, narrow.T2, u_region, np.float32)
     region = slopes(observer.certificate.region)
     found = guarded(
         narrow, system, region, slopes(system.state_bounds), *first_form(system, narrow.T2, u_region, np.float32),

@@ -19,7 +19,7 @@ from gsisio_jax._extras import need
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.bank import main_gain, units
 from gsisio_jax.design.build import design_observer
-from gsisio_jax.design.enclosures import slopes_on
+from gsisio_jax.design.enclosures import slopes_of
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.gains import optimal_gain
@@ -157,8 +157,9 @@ class _Market:
         u_region = Interval(np.zeros(system.m), np.zeros(system.m)) if u is None else u
         if system.takes_u and u is None:
             raise ValueError("allocate: f or g takes u; give `u_region`, the box of known inputs")
-        check_existence(system, feedthrough, slopes_on(system, feedthrough.T2, system.state_bounds, u_region))
-        slopes = slopes_on(system, feedthrough.T2, region, u_region)
+        slopes_on = slopes_of(system, feedthrough.T2, u_region)
+        check_existence(system, feedthrough, slopes_on(system.state_bounds))
+        slopes = slopes_on(region)
         if not slopes.finite:
             raise NoDesignFound(f"allocate: the derivatives of f or g are not bounded on the region {region}")
         # Where slopes vary, the certificate also asks that the boxes fit into the region.

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsisio_jax.design.assemble import Plan, assemble
 from gsisio_jax.design.bank import distinct, gains_for_missing, main_gain, profile_bank, typical_width, units
-from gsisio_jax.design.enclosures import slopes_on
+from gsisio_jax.design.enclosures import Slopes, slopes_of
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.first_sweep import check_first_sweep
@@ -114,11 +114,12 @@ def design_observer(
     if form == "prediction":
         return design_prediction(system, noise, given, u_region, methods, left_inverse, allow_uncertified, derivative)
     feedthrough = factorise(np.asarray(system.H))
-    everywhere = slopes_on(system, feedthrough.T2, system.state_bounds, u_region)
+    slopes_on = slopes_of(system, feedthrough.T2, u_region)
+    everywhere = slopes_on(system.state_bounds)
     check_existence(system, feedthrough, everywhere)
     plan = Plan(system, noise, feedthrough, u_region)
-    box = find_region(system, lambda box: _steady_width(plan, box)) if given is None else given
-    slopes = slopes_on(system, feedthrough.T2, box, u_region)
+    box = find_region(system, lambda box: _steady_width(plan, box, slopes_on(box))) if given is None else given
+    slopes = slopes_on(box)
     if not slopes.finite:
         raise NoDesignFound(
             f"design_observer: the derivatives of f or g are not bounded on the region {box}. Give a smaller region "
@@ -176,9 +177,8 @@ def _check(
     return (region if isinstance(region, Interval) else None), u_region
 
 
-def _steady_width(plan: Plan, region: Interval) -> np.ndarray:
+def _steady_width(plan: Plan, region: Interval, slopes: Slopes) -> np.ndarray:
     """Steady width of the optimal gain on a region; infinite where there is none. Serves region='auto'."""
-    slopes = slopes_on(plan.system, plan.feedthrough.T2, region, plan.u_region)
     if not slopes.finite:
         return np.full(plan.system.n, np.inf)
     problem = plan.problem(slopes)

@@ -22,6 +22,7 @@ Source: design 6 and 12.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import jax
@@ -47,6 +48,11 @@ _TERMS = {"float64": 7, "float32": 4}
 @jax.custom_jvp
 def sin_cos(t: Any) -> tuple[Any, Any]:
     """Sine and cosine for ``|t| < LIMIT``, off by ``2 eps`` at most (the sine by ``2 eps |t|``)."""
+    return _sin_cos(t)
+
+
+@partial(jax.jit, inline=True)  # traced once for every shape
+def _sin_cos(t: Any) -> tuple[Any, Any]:
     name = "float32" if t.dtype == jnp.float32 else "float64"
     kind = np.dtype(t.dtype).type
     k = jnp.round(t * kind(2 / math.pi))

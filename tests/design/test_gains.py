@@ -9,7 +9,7 @@ from scipy import optimize
 
 from gsisio_jax import Interval
 from gsisio_jax.design.assemble import Plan
-from gsisio_jax.design.enclosures import slopes_on
+from gsisio_jax.design.enclosures import slopes_of
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.gains import improve, optimal_gain, profile_gain
 from gsisio_jax.design.problem import GainProblem
@@ -19,7 +19,7 @@ def problem_of(case: systems.Case) -> GainProblem:
     feedthrough = factorise(case.system.H)
     u_region = case.u_region if case.u_region is not None else Interval(np.zeros(0), np.zeros(0))
     return Plan(case.system, case.noise, feedthrough, u_region).problem(
-        slopes_on(case.system, feedthrough.T2, case.region, u_region)
+        slopes_of(case.system, feedthrough.T2, u_region)(case.region)
     )
 
 

@@ -87,7 +87,7 @@ def test_observers_with_other_bounds_still_contain_the_truth():
     small = Interval([-0.1, -0.1], [0.1, 0.1])
     width = {}
     for methods in (("affine", "natural"), ("natural", "abstraction"), ("decomposition", "mean_value")):
-        observer = case.design(bounds=methods, missing=False)
+        observer = case.design(bounds=methods, missing=False).with_rounding("nearest")
         sims, d = (
             jax.vmap(lambda key: gx.simulate(case.system, key, jnp.zeros(2), jnp.zeros((20, 2)), case.noise))(
                 jax.random.split(jax.random.key(1), 50)

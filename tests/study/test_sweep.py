@@ -234,7 +234,7 @@ def plain(linear) -> dict[str, Any]:
     """Eleven boxes on one record."""
     record, _ = linear.simulate(jax.random.key(0))
     radius = np.linspace(0.5, 5, 11)[:, None] * np.ones(2)
-    observer = linear.design(missing=False)
+    observer = linear.design(missing=False).with_rounding("nearest")  # less to compile
     return {
         "observer": observer,
         "initial": gx.Interval.symmetric(radius),
@@ -326,10 +326,10 @@ def test_one_case_in_single_precision(plain):
 
 def test_rounding_to_nearest_is_marked_and_narrower(plain, whole):
     given = {key: value for key, value in plain.items() if key != "observer"}
-    near = gx.sweep(plain["observer"], **given, reduce=("max",), rounding="nearest")
-    assert whole.attrs["guaranteed"] is True
-    assert near.attrs["guaranteed"] is False
-    wider = whole.state_width_max - near.state_width_max
+    sound = gx.sweep(plain["observer"], **given, reduce=("max",), rounding="outward")
+    assert sound.attrs["guaranteed"] is True
+    assert whole.attrs["guaranteed"] is False
+    wider = sound.state_width_max - whole.state_width_max
     assert (wider > 0).all()
     assert (wider < 1e-12 * whole.state_width_max).all()
     with pytest.raises(ValueError, match="sweep: `rounding` must be"):
