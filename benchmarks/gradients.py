@@ -55,7 +55,7 @@ def points(name: str, count: int) -> dict[str, Any]:
     from benchmarks.plants import from_tests
 
     checks, systems = from_tests("gradient_points"), from_tests("systems")
-    checker = checks.Checker(getattr(systems, name)(), count, checks.folded)
+    checker = checks.Checker(getattr(systems, name)(), count, checks.folded, sweeps=3)
     report, not_finite = checker.check(checker.draw()), checker.not_finite()
     return {
         "points": count,
@@ -79,7 +79,7 @@ def memory(steps: int, batch: int) -> dict[str, Any]:
     from gsisio_jax.tuning import fold
 
     case = from_tests("systems").s1()
-    observer = case.design(missing=False)
+    observer = case.design(missing=False, sweeps=3)
     before = peak()
     y = jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (batch, steps, 2)))
 

@@ -23,8 +23,8 @@ def from_tests(name: str) -> Any:
 
 
 def case(name: str, steps: int) -> Any:
-    """A test system by its name in tests/systems.py (s1, s5, ...), with runs of `steps` steps."""
-    return replace(getattr(from_tests("systems"), name)(), steps=steps)
+    """A test system by its name in tests/systems.py (s1, s5, ...), runs of `steps` steps, the default design."""
+    return replace(getattr(from_tests("systems"), name)(), steps=steps, sweeps=3)
 
 
 def records(plant: Any, batch: int) -> tuple[Any, np.ndarray, np.ndarray]:

@@ -22,7 +22,7 @@ def main() -> int:
         case = replace(getattr(from_tests("systems"), system)(**options), steps=steps)
         run, _ = jax.jit(jax.vmap(case.simulate))(jax.random.split(jax.random.key(1), 25))
         u = np.asarray(case.u(steps)) if case.system.m else None
-        observer = case.design(missing=False)
+        observer = case.design(missing=False, sweeps=3)
         start = time.perf_counter()
         found = tune_noise(observer, Records(case.initial, np.asarray(run.y), u), None, "scale", tolerance=1e-4)
         scale = found.factors["scale"]

@@ -29,10 +29,10 @@ class Case:
     d: Callable[[Any, int], Any]  # (key, steps) -> (steps, p)
     u: Callable[[int], Any] = lambda steps: np.zeros((steps, 0))
     u_region: Interval | None = None
+    sweeps: int = 1  # contractions of a step; one, as compiling takes most of the time of a test
 
     def design(self, **options: Any) -> gx.Observer:
-        """With one contraction per step, unless `options` say otherwise: compiling takes most of the time of a test."""
-        options = {"sweeps": 1} | options
+        options = {"sweeps": self.sweeps} | options
         return gx.design_observer(self.system, self.noise, self.region, u_region=self.u_region, **options)
 
     def simulate(self, key: Any, noise: gx.Noise | None = None, d_scale: Any = 1.0) -> tuple[gx.Simulation, Any]:

@@ -89,6 +89,8 @@ time = "t"
 sample_time = 0.1
 y = ["pos", "vel"]
 missing = [-9999, "n/a"]
+[design]
+sweeps = 1
 [outputs]
 netcdf = "cart.nc"
 csv = "boxes.csv"

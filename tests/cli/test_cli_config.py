@@ -43,7 +43,7 @@ CASES = {
     "same file": ('"boxes.csv"', '"cart.nc"', ["outputs: netcdf, csv and picture must be different files"]),
     "syntax": ("[noise]", "[noise", ["cart.toml: not valid TOML", "line 8"]),
     "conflict rule": ("[outputs]", "[estimate]\non_conflict = 'stop'\n[outputs]", ["estimate.on_conflict", "'stop'"]),
-    "gains": ("[outputs]", "[design]\ngains = 0\n[outputs]", ["design.gains must be greater than or equal to 1"]),
+    "gains": ("sweeps = 1", "gains = 0", ["design.gains must be greater than or equal to 1"]),
     "draw": ("[outputs]", '[outputs]\ndraw = "cart_model:paint"', ["outputs.draw: cart_model has no attribute paint"]),
 }
 

@@ -1,6 +1,7 @@
 """Data that contradict the bounds: what is said, what is returned, and how the run goes on."""
 
 import io
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,12 @@ from gsisio_jax.estimation import collect, resume
 ROUNDING = 1e-9
 K, JUMP = 30, 40.0
 NAMES = ("none", "jump", "impossible", "impossible and far")
+
+
+@pytest.fixture(scope="module")
+def target(target):
+    """To nearest there is less to compile."""
+    return replace(target, observer=target.observer.with_rounding("nearest"))
 
 
 @pytest.fixture(scope="module")
