@@ -186,19 +186,19 @@ def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
 
 @partial(jax.jit, static_argnames="hold")
 def _estimate(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Estimate:
-    carry, first = recursion_of(observer).begin(observer, initial, y[0], u[0], noise_at(noise, 0), hold)
+    carry, first = begin(observer, initial, y[0], u[0], noise_at(noise, 0), hold)
     _, rest = _scan(observer, carry, y[1:], u[1:], _rows_from(noise, 1), hold)
     return _as_estimate(observer, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest))
 
 
 @partial(jax.jit, static_argnames="hold")
 def _start(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
-    return recursion_of(observer).begin(observer, initial, y, u, noise, hold)
+    return begin(observer, initial, y, u, noise, hold)
 
 
 @partial(jax.jit, static_argnames="hold")
 def _step(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
-    return recursion_of(observer).advance(observer, carry, y, u, noise, hold)
+    return advance(observer, carry, y, u, noise, hold)
 
 
 @partial(jax.jit, static_argnames="hold")
@@ -209,13 +209,27 @@ def _resume(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, h
 def _scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
     def body(carry: Carry, row: Any) -> tuple[Carry, StepOutput]:
         y_k, u_k, now = row
-        return recursion_of(observer).advance(observer, carry, y_k, u_k, noise_of_row(noise, now), hold)
+        return advance(observer, carry, y_k, u_k, noise_of_row(noise, now), hold)
 
     return jax.lax.scan(body, carry, (y, u, noise_rows(noise)))
 
 
+# Inlined, so programs are as if these were plain functions; but what JAX traced of a step once serves every batch, scan
+# and study of that observer, and tracing takes seconds.
+@partial(jax.jit, static_argnames="hold", inline=True)
+def begin(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    """Step 0 of the recursion that belongs to this kind of observer."""
+    return recursion_of(observer).begin(observer, initial, y, u, noise, hold)
+
+
+@partial(jax.jit, static_argnames="hold", inline=True)
+def advance(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    """One step of it."""
+    return recursion_of(observer).advance(observer, carry, y, u, noise, hold)
+
+
 def recursion_of(observer: AnyObserver) -> Any:
-    """The module whose `begin` and `advance` belong to this kind of observer."""
+    """The module of this kind of observer."""
     return prediction if isinstance(observer, PredictionObserver) else recursion
 
 

@@ -7,6 +7,8 @@ import jax
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+# Tracing makes millions of small objects that live on: looking for garbage as often as usual is a tenth of the time.
+gc.set_threshold(100_000, 20, 50)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -64,13 +64,12 @@ def _case(
 ) -> dict[str, Any]:
     length, steady = case.get("length"), case["steady"]
     carry, carried, states, _ = _start(observer, case, source, reductions, hold)
-    advance = estimation.recursion_of(observer).advance
 
     def body(state: Any, step: Any) -> tuple[Any, Any]:
         carry, carried, states = state
         k, given = step
         row, carried = source.following(observer, case, carried, k, given)
-        carry, out = advance(observer, carry, row.y, row.u, row.noise, hold)
+        carry, out = estimation.advance(observer, carry, row.y, row.u, row.noise, hold)
         context = Context(steady, row.x, row.d)
         after, kept = [], []
         for reduction, before in zip(reductions, states, strict=True):
@@ -103,8 +102,7 @@ def _start(
 ) -> tuple[Any, Any, list[Any], Any]:
     """Step 0: the carry of the observer, that of the source, the states of the reductions, and the boxes."""
     row, carried = source.first(observer, case)
-    begin = estimation.recursion_of(observer).begin
-    carry, out = begin(observer, case["initial"], row.y, row.u, row.noise, hold)
+    carry, out = estimation.begin(observer, case["initial"], row.y, row.u, row.noise, hold)
     context, zero = Context(case["steady"], row.x, row.d), jnp.int32(0)
     states = [r.row(out, zero, context) if isinstance(r, Kept) else r.init(out, context) for r in reductions]
     return carry, carried, jax.tree.map(jnp.asarray, states), out

@@ -252,8 +252,11 @@ def test_new_numbers_compile_nothing(small):
         again(1.5)
         assert compiled == []
         assert len(traces) == before
-        gx.estimate(small.observer, small.initial, small.y[:3])  # the counters do count
+        # A record of another length: the step itself is known still.
+        gx.estimate(small.observer, small.initial, small.y[:3])
         assert compiled
+        assert len(traces) == before
+        gx.estimate(small.observer, small.initial, small.y[:3], rounding="outward")  # the counter does count
         assert len(traces) > before
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
