@@ -35,6 +35,7 @@ def axis() -> Axis:
     system = gx.System(lambda x: jnp.asarray(A) @ x, lambda x: x, G=[[0.005], [0.1]], H=np.zeros((2, 1)))
     noise = gx.Noise(gx.Interval.symmetric([0.02, 0.05]), gx.Interval.symmetric([0.1, 0.05]))
     observer = gx.design_observer(system, noise, gx.Interval.entire(2), missing=False, sweeps=1)
+    observer = observer.with_rounding("nearest")  # less to compile
 
     def one(key: Any) -> Any:
         keys = jax.random.split(key, 3)
@@ -50,4 +51,4 @@ def small() -> gx.Observer:
     """One state, no unknown input: what costs the least to compile."""
     system = gx.System(lambda x: 0.9 * x, lambda x: x, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
     noise = gx.Noise(gx.Interval.symmetric([0.05]), gx.Interval.symmetric([0.1]))
-    return gx.design_observer(system, noise, gx.Interval.entire(1), missing=False, sweeps=1)
+    return gx.design_observer(system, noise, gx.Interval.entire(1), missing=False, sweeps=1).with_rounding("nearest")
