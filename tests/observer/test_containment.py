@@ -22,6 +22,9 @@ CASES = {
 }
 
 
+OUTWARD = ("S4b", "S5", "S7")
+
+
 def run_many(case: systems.Case):
     """A compiled batch of runs of a case; observer, noise and size of d may change without compiling anew."""
 
@@ -58,7 +61,9 @@ def check(est, inside, simulated):
 def test_zero_violations(name):
     case, runs = CASES[name]
     assert runs * case.steps >= 20_000
-    check(*run_many(case)(case.design(missing=False), runs))
+    observer = case.design(missing=False)
+    # To nearest there is less to compile; rounding is no matter of the plant.
+    check(*run_many(case)(observer if name in OUTWARD else observer.with_rounding("nearest"), runs))
 
 
 @pytest.mark.parametrize("d_scale", [1.0, 1e3])
