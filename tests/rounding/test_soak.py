@@ -1,4 +1,4 @@
-"""A hundred million primitives and ten million observer steps, in each precision (`pytest -m soak`, an hour or two)."""
+"""A hundred million primitives and ten million observer steps, in each precision (`pytest -m soak`, about an hour)."""
 
 from __future__ import annotations
 
