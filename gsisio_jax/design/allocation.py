@@ -19,12 +19,12 @@ from gsisio_jax._extras import need
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.bank import main_gain, units
 from gsisio_jax.design.build import design_observer
-from gsisio_jax.design.enclosures import slopes_of
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
+from gsisio_jax.guard import slopes_of
 from gsisio_jax.interval import Interval
 from gsisio_jax.observer import Observer
 from gsisio_jax.system import Noise, System

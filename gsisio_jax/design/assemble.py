@@ -10,12 +10,11 @@ import numpy as np
 
 from gsisio_jax.certificate import Certificate
 from gsisio_jax.contraction import Bank
-from gsisio_jax.design.enclosures import Slopes
 from gsisio_jax.design.feedthrough import Feedthrough
 from gsisio_jax.design.inputs import InputBounds
 from gsisio_jax.design.planes import plane_bounds
 from gsisio_jax.design.problem import GainProblem, beyond_rounding, without_rounding
-from gsisio_jax.guard import with_output
+from gsisio_jax.guard import Slopes, with_output
 from gsisio_jax.inclusion.abstraction import Abstraction
 from gsisio_jax.interval import Interval
 from gsisio_jax.observer import Observer

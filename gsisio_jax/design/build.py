@@ -10,7 +10,6 @@ import numpy as np
 
 from gsisio_jax.design.assemble import Plan, assemble
 from gsisio_jax.design.bank import distinct, gains_for_missing, main_gain, profile_bank, typical_width, units
-from gsisio_jax.design.enclosures import Slopes, slopes_of
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.first_sweep import check_first_sweep
@@ -20,7 +19,7 @@ from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_pre
 from gsisio_jax.design.recovery import recovers
 from gsisio_jax.design.region import find_region
 from gsisio_jax.errors import NoDesignFound
-from gsisio_jax.guard import first_form, guarded
+from gsisio_jax.guard import Slopes, first_form, guarded, slopes_of
 from gsisio_jax.inclusion.methods import DEFAULT, check_methods
 from gsisio_jax.interval import Interval
 from gsisio_jax.observer import Observer

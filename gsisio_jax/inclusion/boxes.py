@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from gsisio_jax import rounding
 from gsisio_jax.fusion import add_up
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval import Interval, mended
 from gsisio_jax.ties import larger, smaller
 
 
@@ -182,10 +182,8 @@ def slope_reach(slope: Any, box: Any) -> Any:
     """``sum |slope| reach``, to nearest; ``0 * inf = 0``."""
     far = jnp.reshape(box.reach, (-1,) + (1,) * (slope.ndim - 1))
     size = abs(slope)
-    if is_known(size):
-        terms = jnp.where(size == 0, 0, size * far) if (size == 0).any() else size * far
-    else:
-        terms = jnp.where(size == 0, 0, size * far)
+    no_zero = is_known(size) and size.all()
+    terms = size * far if no_zero else jnp.where(size == 0, 0, size * far)
     return add_up(jax.lax.stop_gradient(terms), 0)
 
 
@@ -240,7 +238,7 @@ def guard(a: Interval) -> Interval:
     if is_known(a.lower) and is_known(a.upper) and np.isfinite(a.lower).all() and np.isfinite(a.upper).all():
         return a
     if rounding.outward():
-        return Interval.unchecked(rounding.unbounded(a.lower, -jnp.inf), rounding.unbounded(a.upper, jnp.inf))
+        return mended(a)
     largest = jnp.finfo(a.lower.dtype).max
     # Chosen, not clipped: the derivative of a minimum is ten operations.
     return Interval.unchecked(

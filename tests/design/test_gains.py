@@ -9,10 +9,10 @@ from scipy import optimize
 
 from gsisio_jax import Interval
 from gsisio_jax.design.assemble import Plan
-from gsisio_jax.design.enclosures import slopes_of
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.gains import improve, optimal_gain, profile_gain
 from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.guard import slopes_of
 
 
 def problem_of(case: systems.Case) -> GainProblem:
