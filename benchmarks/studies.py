@@ -11,7 +11,7 @@ import numpy as np
 import gsisio_jax as gx
 from benchmarks.plants import case
 from benchmarks.throughput import AGREEMENT, peak, timed
-from gsisio_jax.recursion import advance, begin
+from gsisio_jax.observer.step import advance, begin
 
 REDUCTIONS = ("final", "max", "mean")
 PART = 0.05  # of the boxes, for the comparison

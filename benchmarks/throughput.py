@@ -13,7 +13,7 @@ import numpy as np
 
 import gsisio_jax as gx
 from benchmarks.plants import case, from_tests, records
-from gsisio_jax.recursion import advance, begin
+from gsisio_jax.observer.step import advance, begin
 
 ROUNDING = 1e-12  # half of the records have noise on its very bounds, reached only up to rounding
 LONG = 20.0  # seconds: calls that take longer are timed once after the warm one

@@ -2,25 +2,25 @@
 
 from typing import TYPE_CHECKING, Any
 
-from gsisio_jax import estimation, inclusion
-from gsisio_jax.alarms import Alarm
-from gsisio_jax.certificate import Certificate
+from gsisio_jax import inclusion
+from gsisio_jax._version import __version__ as __version__
 from gsisio_jax.errors import ContainmentLost, FramerNotGuaranteed, NoDesignFound, ObserverDoesNotExist
-from gsisio_jax.estimation import Estimate, estimate, start, step
 from gsisio_jax.interval import Interval, hull, intersect, linear_image
-from gsisio_jax.observer import Carry, Observer, StepOutput
-from gsisio_jax.prediction import PredictionObserver
-from gsisio_jax.simulation import Simulation, simulate
-from gsisio_jax.status import Status
-from gsisio_jax.system import Noise, System
+from gsisio_jax.observer import estimation
+from gsisio_jax.observer.alarms import Alarm
+from gsisio_jax.observer.certificate import Certificate
+from gsisio_jax.observer.estimation import Estimate, estimate, start, step
+from gsisio_jax.observer.prediction_step import PredictionObserver
+from gsisio_jax.observer.status import Status
+from gsisio_jax.observer.types import Carry, Observer, StepOutput
+from gsisio_jax.plant.simulation import Simulation, simulate
+from gsisio_jax.plant.system import Noise, System
 
 if TYPE_CHECKING:
     from gsisio_jax import dataset, examples, paper, plot, study, tuning
     from gsisio_jax.design import design_observer
     from gsisio_jax.study import grid, monte_carlo, sweep
     from gsisio_jax.tuning import allocate, tune_noise, width_sensitivity
-
-__version__ = "0.1.0"
 
 __all__ = [
     "Alarm",

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ._extras import need
-from .status import flag_attributes
+from gsisio_jax._extras import need
+from gsisio_jax._version import __version__
+from gsisio_jax.observer.status import flag_attributes
 
 
 def to_dataset(
@@ -51,8 +52,6 @@ def to_dataset(
         ValueError: a batch of estimates, or a list of the wrong length.
         MissingExtra: xarray is not installed.
     """
-    import gsisio_jax
-
     xarray = need("xarray", extra="cli", purpose="a labelled dataset")
     state_shape = np.shape(est.state.lower)
     if len(state_shape) != 2:
@@ -98,7 +97,7 @@ def to_dataset(
         "title": title,
         "alarms": json.dumps(alarms, ensure_ascii=False),
         "certificate": "" if certificate is None else str(certificate),
-        "library": f"gsisio_jax {gsisio_jax.__version__}",
+        "library": f"gsisio_jax {__version__}",
     }
     return xarray.Dataset(variables, coords={"time": ("time", time, time_attributes)}, attrs=attributes)
 

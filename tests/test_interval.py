@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gsisio_jax import Interval, hull, intersect, linear_image, rounding
-from gsisio_jax.interval import cast_down, cast_up, scale
+from gsisio_jax import Interval, hull, intersect, linear_image
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import cast_down, cast_up, scale
 
 FINITE = st.floats(-1e6, 1e6, allow_nan=False, width=32)
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsisio_jax.ties import larger, largest, smaller, smallest
+from gsisio_jax.interval.minmax import larger, largest, smaller, smallest
 
 EPS = float(np.finfo(np.float64).eps)
 SPECIAL = np.array([-np.inf, np.inf, 0.0, -0.0, 1.0, 1.0 + EPS, 1.0 - EPS, -1.0, 1e-17, 1e300, -1e300, 1e-300])

@@ -99,7 +99,7 @@ def _parser() -> argparse.ArgumentParser:
 
 class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
-        from gsisio_jax import __version__
+        from .._version import __version__
 
         print(f"gsisio {__version__}")
         parser.exit()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..interval import Interval
-from ..system import Noise, System
+from ..plant.system import Noise, System
 from .config import Config, Signal
 from .errors import UserError, reason
 from .fields import Bounds

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from ..status import Status
+from ..observer.status import Status
 from .problem import Problem
 from .run import Outcome
 from .table import Table

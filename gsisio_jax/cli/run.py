@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ..estimation import OnConflict
+from ..observer.estimation import OnConflict
 from .problem import Problem
 from .progress import DelayedProgress
 from .table import Table

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..interval import Interval
+from ..plant.system import Noise
 from ..study import grid
-from ..system import Noise
 from .config import Config, TablePart
 from .errors import UserError, reason
 from .problem import Problem, resolve

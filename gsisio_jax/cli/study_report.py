@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ..observer.status import Status
 from ..plot.scales import quantiles
 from ..plot.study import with_entry
-from ..status import Status
 from .problem import Names, Problem
 from .report import Summary, certificate_lines, short
 

@@ -1,4 +1,4 @@
-"""Offline design: gains, certificate, existence. The only part of the package that imports cvxpy."""
+"""Offline design: gains, certificate, existence. With the co-design of `tuning` the only part that imports cvxpy."""
 
 from gsisio_jax.design.build import design_observer
 

@@ -21,8 +21,8 @@ import numpy as np
 
 from gsisio_jax.design.gains import solve
 from gsisio_jax.inclusion import UnknownPrimitiveError, affine, jacobian
-from gsisio_jax.inclusion.abstraction import Abstraction
-from gsisio_jax.interval import Interval
+from gsisio_jax.inclusion.planes import Abstraction
+from gsisio_jax.interval.box import Interval
 
 _MAX_STATES, _MAX_VERTICES = 12, 2**16
 _BATCH = 1024  # boxes per call of a compiled function

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from gsisio_jax.certificate import Certificate
-from gsisio_jax.contraction import Bank
 from gsisio_jax.design.feedthrough import Feedthrough
 from gsisio_jax.design.inputs import InputBounds
 from gsisio_jax.design.planes import plane_bounds
 from gsisio_jax.design.problem import GainProblem, beyond_rounding, without_rounding
-from gsisio_jax.guard import Slopes, with_output
-from gsisio_jax.inclusion.abstraction import Abstraction
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import Observer
-from gsisio_jax.system import Noise, System
+from gsisio_jax.inclusion.planes import Abstraction
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.certificate import Certificate
+from gsisio_jax.observer.contractors import LinearBounds
+from gsisio_jax.observer.rounding_constants import Slopes, with_output
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.plant.system import Noise, System
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,9 @@ def assemble(
     bounds: tuple[str, ...],
     sweeps: int,
 ) -> Observer:
-    """The observer of a verified bank of gains, the first of which is the certified one; `guarded` completes it.
+    """The observer of a verified bank of gains, the first of which is the certified one.
+
+    `with_rounding_constants` completes it.
 
     Args:
         plan: plant, noise and feedthrough of the design.
@@ -91,7 +93,7 @@ def assemble(
         noise=plan.noise,
         certificate=certificate,
         gains=with_output(
-            Bank(
+            LinearBounds(
                 residual=np.concatenate([P, -stacked[:, :, :l]], axis=2),
                 output=np.zeros((len(bank), problem.n, l)),
                 remainder=stacked[:, :, l : l + q],
@@ -113,7 +115,7 @@ def assemble(
         current_input_directions=feedthrough.V1,
         abstraction=planes(system.maps),
         output_abstraction=planes(lambda x, u: feedthrough.T2 @ system.measurement(x, u)),
-        guard=unfinished,
+        rounding_constants=unfinished,
         output_rows=feedthrough.output_rows,
         bounds=bounds,
         sweeps=sweeps,

@@ -14,8 +14,8 @@ import cvxpy as cp
 import numpy as np
 
 from gsisio_jax.design.gains import solve
+from gsisio_jax.design.inverse_rows import RESIDUAL, checked, equilibrated, equilibration, residual, restored
 from gsisio_jax.design.problem import without_rounding
-from gsisio_jax.design.rows import RESIDUAL, checked, equilibrated, equilibration, residual, restored
 
 _SINGULAR = 1e-10  # a support whose equilibrated rows have a smaller ratio of singular values counts as dependent
 ZERO = 1e-12  # equilibrated weights below this share of the largest are zeros of the minimal support

@@ -9,22 +9,22 @@ from typing import Any, Literal, overload
 import numpy as np
 
 from gsisio_jax.design.assemble import Plan, assemble
-from gsisio_jax.design.bank import distinct, gains_for_missing, main_gain, profile_bank, typical_width, units
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
-from gsisio_jax.design.first_sweep import check_first_sweep
+from gsisio_jax.design.gain_selection import distinct, gains_for_missing, main_gain, profile_bank, typical_width, units
 from gsisio_jax.design.gains import optimal_gain
+from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
 from gsisio_jax.design.recovery import recovers
 from gsisio_jax.design.region import find_region
 from gsisio_jax.errors import NoDesignFound
-from gsisio_jax.guard import Slopes, first_form, guarded, slopes_of
-from gsisio_jax.inclusion.methods import DEFAULT, check_methods
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import Observer
-from gsisio_jax.prediction import PredictionObserver
-from gsisio_jax.system import Noise, System
+from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.prediction_step import PredictionObserver
+from gsisio_jax.observer.rounding_constants import Slopes, first_form, slopes_of, with_rounding_constants
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.plant.system import Noise, System
 
 
 @overload
@@ -135,8 +135,8 @@ def design_observer(
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
     outputs, slack = first_form(system, feedthrough.T2, u_region)
     observer = assemble(plan, problem, box, bank, input_bounds(problem, width), everywhere.affine, methods, sweeps)
-    observer = guarded(observer, system, slopes, everywhere, outputs, slack, np.float64)
-    check_first_sweep(problem, bank[0], observer, outputs)
+    observer = with_rounding_constants(observer, system, slopes, everywhere, outputs, slack, np.float64)
+    check_initial_contraction(problem, bank[0], observer, outputs)
     if not missing:
         return observer
     certificate = replace(observer.certificate, recoverable=recovers(observer, width, u_region))

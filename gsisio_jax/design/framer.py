@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsisio_jax.certificate import spectral_radius
-from gsisio_jax.system import System
+from gsisio_jax.observer.certificate import spectral_radius
+from gsisio_jax.plant.system import System
 
 
 class FramerGains(NamedTuple):

@@ -14,11 +14,11 @@ from typing import NamedTuple
 import cvxpy as cp
 import numpy as np
 
-from gsisio_jax.contraction import Bank
 from gsisio_jax.design.basic_inverses import basic_left_inverses, circuits
 from gsisio_jax.design.gains import solve
 from gsisio_jax.design.problem import GainProblem, without_rounding
-from gsisio_jax.observer import ExactInputs
+from gsisio_jax.observer.contractors import LinearBounds
+from gsisio_jax.observer.types import ExactInputs
 
 MOST_SUPPORTS = 500  # basic left inverses per group of inputs that share rows; each costs time in every step
 
@@ -26,7 +26,7 @@ MOST_SUPPORTS = 500  # basic left inverses per group of inputs that share rows; 
 class InputBounds(NamedTuple):
     """Everything that bounds d[k-1]: the joint bounds, the exact ones for a box of [G; H] d, and a note on these."""
 
-    inverses: Bank
+    inverses: LinearBounds
     exact: ExactInputs
     note: str
 
@@ -41,7 +41,7 @@ def input_bounds(problem: GainProblem, width: np.ndarray) -> InputBounds:
     return InputBounds(_joint(problem, width), *_exact(problem, width))
 
 
-def _joint(problem: GainProblem, width: np.ndarray) -> Bank:
+def _joint(problem: GainProblem, width: np.ndarray) -> LinearBounds:
     n, l, q, p = problem.n, problem.l, problem.q, problem.G.shape[1]
     s = problem.columns - l - q
     direct, lifted = [], []
@@ -61,7 +61,7 @@ def _joint(problem: GainProblem, width: np.ndarray) -> Bank:
         known = (np.eye(p) - L @ problem.seen)[:, ~problem.free]
         residual = -np.concatenate([without_rounding(L[:, l:] @ problem.C), L_y], axis=1)
         rows.append((residual, without_rounding(L_z @ problem.T2), L_z, L_s, known, np.zeros((p, n))))
-    return Bank(*(np.stack(parts) for parts in zip(*rows, strict=True)))
+    return LinearBounds(*(np.stack(parts) for parts in zip(*rows, strict=True)))
 
 
 def _exact(problem: GainProblem, width: np.ndarray) -> tuple[ExactInputs, str]:

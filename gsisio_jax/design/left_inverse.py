@@ -7,10 +7,10 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from gsisio_jax.certificate import spectral_radius
 from gsisio_jax.design.gains import solve
+from gsisio_jax.design.inverse_rows import RESIDUAL, checked, equilibration, residual, restored
 from gsisio_jax.design.problem import without_rounding
-from gsisio_jax.design.rows import RESIDUAL, checked, equilibration, residual, restored
+from gsisio_jax.observer.certificate import spectral_radius
 
 _SEEN = 1e-6  # input directions that H shows less strongly than this are treated as if it did not show them
 

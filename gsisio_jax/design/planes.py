@@ -8,9 +8,9 @@ from typing import Any
 import jax.numpy as jnp
 
 from gsisio_jax.design.abstraction import affine_abstraction
-from gsisio_jax.inclusion.abstraction import Abstraction
-from gsisio_jax.interval import Interval
-from gsisio_jax.system import System
+from gsisio_jax.inclusion.planes import Abstraction
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.system import System
 
 
 def plane_bounds(

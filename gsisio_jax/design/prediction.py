@@ -7,17 +7,17 @@ from typing import Any, Literal
 import numpy as np
 
 from gsisio_jax import inclusion
-from gsisio_jax.certificate import Certificate, spectral_radius
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.framer import FramerGains, framer_gains
 from gsisio_jax.design.left_inverse import smallest_radius_inverse
 from gsisio_jax.design.planes import plane_bounds
 from gsisio_jax.design.region import find_region
 from gsisio_jax.errors import FramerNotGuaranteed
-from gsisio_jax.inclusion.decomposition import width_gain
-from gsisio_jax.interval import Interval
-from gsisio_jax.prediction import PredictionObserver
-from gsisio_jax.system import Noise, System
+from gsisio_jax.inclusion.mixed_monotone import width_gain
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.certificate import Certificate, spectral_radius
+from gsisio_jax.observer.prediction_step import PredictionObserver
+from gsisio_jax.plant.system import Noise, System
 
 LeftInverse = Literal["pseudo", "feedthrough", "smallest"]
 DEFAULT_BOUNDS = ("affine", "natural", "decomposition", "mean_value")

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsisio_jax.certificate import spectral_radius
+from gsisio_jax.observer.certificate import spectral_radius
 
 
 @dataclass(frozen=True)

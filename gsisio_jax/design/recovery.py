@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.estimation import estimate
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import Observer
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.estimation import estimate
+from gsisio_jax.observer.types import Observer
 
 
 def recovers(observer: Observer, width: np.ndarray, u_region: Interval) -> bool:

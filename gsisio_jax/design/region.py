@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from gsisio_jax.errors import NoDesignFound
-from gsisio_jax.interval import Interval
-from gsisio_jax.system import System
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.system import System
 
 _MARGIN = 1.05  # regions are this much wider than the steady width they were made from
 _ROUNDS = 40

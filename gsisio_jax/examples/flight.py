@@ -17,7 +17,7 @@ import numpy as np
 from gsisio_jax._extras import need
 from gsisio_jax.examples.projection import ObliqueMercator
 from gsisio_jax.interval import Interval
-from gsisio_jax.system import System
+from gsisio_jax.plant import System
 
 if TYPE_CHECKING:
     import pandas as pd

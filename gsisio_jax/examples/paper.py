@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.system import System
+from gsisio_jax.plant import System
 
 G = np.array([[0.0, -0.1], [0.2, -0.2]])
 H = np.array([[-0.1, 0.3], [0.25, -0.75]])

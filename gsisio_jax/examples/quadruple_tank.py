@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval import Interval
-from gsisio_jax.system import Noise, System
+from gsisio_jax.plant import Noise, System
 
 AREA = np.array([28.0, 32.0, 28.0, 32.0])  # cm^2, of the tanks
 OUTLET = np.array([0.071, 0.057, 0.071, 0.057])  # cm^2, of their outlets

@@ -12,9 +12,9 @@
 Source: design 5.
 """
 
-from gsisio_jax.inclusion.abstraction import Abstraction
-from gsisio_jax.inclusion.api import AffineForm, affine, jacobian, mean_value, natural
-from gsisio_jax.inclusion.decomposition import (
+from gsisio_jax.inclusion.interpreter import register_bounds
+from gsisio_jax.inclusion.intersection import METHODS, bound
+from gsisio_jax.inclusion.mixed_monotone import (
     decomposition,
     decomposition_function,
     decomposition_gain,
@@ -22,9 +22,9 @@ from gsisio_jax.inclusion.decomposition import (
     tight,
     width_gain,
 )
-from gsisio_jax.inclusion.interpreter import register_bounds
-from gsisio_jax.inclusion.methods import METHODS, bound
-from gsisio_jax.inclusion.table import UnknownPrimitiveError
+from gsisio_jax.inclusion.planes import Abstraction
+from gsisio_jax.inclusion.rules.registry import UnknownPrimitiveError
+from gsisio_jax.inclusion.transforms import AffineForm, affine, jacobian, mean_value, natural
 
 __all__ = [
     "METHODS",

@@ -19,11 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from gsisio_jax import rounding
-from gsisio_jax.inclusion import linear, logic
-from gsisio_jax.inclusion.boxes import fold, is_known, known_if_concrete
+from gsisio_jax.inclusion.form_arithmetic import fold, is_known, known_if_concrete
 from gsisio_jax.inclusion.node import (
-    THIN,
+    POINT_MODE,
     Form,
     Node,
     as_node,
@@ -36,8 +34,10 @@ from gsisio_jax.inclusion.node import (
     settled,
     slope_of,
 )
-from gsisio_jax.inclusion.table import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
-from gsisio_jax.interval import Interval
+from gsisio_jax.inclusion.rules import comparison, linear
+from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval
 
 # Longer loops are kept as loops: compile time grows with every unrolled turn.
 _UNROLL = 16
@@ -80,7 +80,7 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
     if name in REDUCTIONS or name in ELEMENTWISE:
         aligned = args if name in REDUCTIONS else _aligned(args, eqn.outvars[0].aval.shape)
         value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
-        return settle(value) if is_node(value) and not value.raw else value
+        return settle(value) if is_node(value) and not value.unnormalised else value
     raise UnknownPrimitiveError(name)
 
 
@@ -139,7 +139,7 @@ def _cond(eqn: Any, index: Any, *args: Any) -> Any:
     outcomes = [evaluate(branch.jaxpr, branch.consts, args) for branch in branches]
     if len(branches) == 2 and not is_node(index):
         index = index != 0
-    return [logic.select(index, *values) for values in zip(*outcomes, strict=True)]
+    return [comparison.select(index, *values) for values in zip(*outcomes, strict=True)]
 
 
 def _scan(eqn: Any, *args: Any) -> Any:
@@ -226,7 +226,7 @@ def _bare(value: Any) -> Any:
 
 def _form(node: Node) -> Form | None:
     """The form of a node; none where only ranges were asked for."""
-    return None if THIN.get() else node.form
+    return None if POINT_MODE.get() else node.form
 
 
 def _unstack(form: Any, jac: Any, box: Any) -> tuple[Any, Any]:

@@ -9,10 +9,10 @@ Three tiers, from least to most:
 
 Inside the engine the axis over the entries of ``x`` comes first, so that slopes broadcast against values.
 
-Rounding: ranges, offsets and Jacobians are boxes, rounded outward by every operation here (`gsisio_jax.rounding`). A
-slope is rounded to nearest, and what that may have lost is kept beside it, as `slack`: times the reach of the box it
-belongs to the offset. Kept apart, because the box may be infinite, and because slopes of linear functions are often
-exact: then the form of such a function on an infinite box stays what it is.
+Rounding: ranges, offsets and Jacobians are boxes, rounded outward by every operation here (see
+`gsisio_jax.interval.rounding`). A slope is rounded to nearest, and what that may have lost is kept beside it, as
+`slack`: times the reach of the box it belongs to the offset. Kept apart, because the box may be infinite, and because
+slopes of linear functions are often exact: then the form of such a function on an infinite box stays what it is.
 """
 
 from __future__ import annotations
@@ -25,9 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax import rounding
-from gsisio_jax.fusion import add_up, once
-from gsisio_jax.inclusion.boxes import (
+from gsisio_jax.inclusion.form_arithmetic import (
     finite_numbers,
     guard,
     is_exact,
@@ -42,12 +40,14 @@ from gsisio_jax.inclusion.boxes import (
     slope_reach,
     spare,
 )
-from gsisio_jax.interval import Interval, choose, held, reach
-from gsisio_jax.ties import larger, smaller
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, choose, held, reach
+from gsisio_jax.interval.minmax import larger, smaller
+from gsisio_jax.interval.xla import add_up, once
 
 # The box is a point and only ranges are asked for: forms are kept for linear functions alone, whose value at the point
 # they give with a single widening.
-THIN: ContextVar[bool] = ContextVar("gsisio_jax_thin", default=False)
+POINT_MODE: ContextVar[bool] = ContextVar("gsisio_jax_point_mode", default=False)
 _LOSS = 64.0  # in best_form: narrower by less than this many ulps is narrower by rounding
 
 
@@ -82,7 +82,7 @@ class Form(eqx.Module):
 
     def image(self) -> Interval:
         """Bounds of the value that follow from the form alone."""
-        if self.is_told():
+        if self.is_static_affine():
             return self._known_image()
         low, high = slope_products(self.slope, self.box)
         lower, upper = add_up(low, 0) + self.offset.lower, add_up(high, 0) + self.offset.upper
@@ -95,7 +95,7 @@ class Form(eqx.Module):
         upper = upper + (loss + rounding.error(add_up(abs(high), 0) + abs(self.offset.upper) + loss, n, n))
         return Interval.unchecked(lower, upper)
 
-    def is_told(self) -> bool:
+    def is_static_affine(self) -> bool:
         """All numbers but those of the box are known while tracing: the function is linear."""
         return finite_numbers(self.slope, self.offset.lower, self.offset.upper) and (
             self.slack is None or finite_numbers(self.slack)
@@ -152,17 +152,17 @@ class Form(eqx.Module):
 class Node(eqx.Module):
     """A value that is not constant: range, and optionally an affine form and a Jacobian enclosure (n, *shape).
 
-    The range of a linear function (`Form.is_told`) need not be given: no other one is better than the image of its
-    form, which is computed when it is asked for.
+    The range of a linear function (`Form.is_static_affine`) need not be given: no other one is better than the image
+    of its form, which is computed when it is asked for.
 
-    Sums hand a NaN on, so it need not be looked for after each of them: `raw` nodes may hold one where they overflowed,
-    until `settle` turns it into "no bound". Every rule that compares its arguments settles them first.
+    Sums hand a NaN on, so it need not be looked for after each of them: `unnormalised` nodes may hold one where they
+    overflowed, until `settle` turns it into "no bound". Every rule that compares its arguments settles them first.
     """
 
     given: Interval | None
     form: Form | None = None
     jac: Interval | None = None
-    raw: bool = eqx.field(static=True, default=False)
+    unnormalised: bool = eqx.field(static=True, default=False)
 
     @property
     def range(self) -> Interval:
@@ -186,11 +186,11 @@ class Node(eqx.Module):
         return self.range.lower.dtype
 
     @property
-    def is_told(self) -> bool:
+    def is_static_affine(self) -> bool:
         """A linear function or a constant, with known numbers."""
         if self.form is None:
             return self.given is not None and finite_numbers(self.given.lower, self.given.upper)
-        return self.form.is_told()
+        return self.form.is_static_affine()
 
     @property
     def offset(self) -> Interval:
@@ -208,7 +208,9 @@ def meet(node: Node) -> Node:
         return node
     natural, image = node.range, node.form.image()
     lower, upper = larger(natural.lower, image.lower), smaller(natural.upper, image.upper)
-    return Node(held(choose(lower <= upper, Interval.unchecked(lower, upper), natural)), node.form, node.jac, node.raw)
+    return Node(
+        held(choose(lower <= upper, Interval.unchecked(lower, upper), natural)), node.form, node.jac, node.unnormalised
+    )
 
 
 def best_form(slope: Any, offset: Interval, natural: Interval, box: Domain, slack: Any = None, size: Any = 0) -> Form:
@@ -233,7 +235,7 @@ def unsettled(given: Interval | None, form: Form | None, jac: Interval | None) -
 
 def settled(value: Any) -> Any:
     """`settle` where that has not been done."""
-    return settle(value) if is_node(value) and value.raw else value
+    return settle(value) if is_node(value) and value.unnormalised else value
 
 
 def settle(node: Node) -> Node:
@@ -268,7 +270,7 @@ def parts(values: Any) -> tuple[Any, Any]:
     box, jac = None, None
     for value in values:
         if is_node(value):
-            box = value.form.box if box is None and value.form is not None and not THIN.get() else box
+            box = value.form.box if box is None and value.form is not None and not POINT_MODE.get() else box
             jac = value.jac if jac is None else jac
     return box, jac
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from gsisio_jax.design.build import design_observer
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse
-from gsisio_jax.estimation import estimate
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.estimation import estimate
 from gsisio_jax.paper.lipschitz import lipschitz_constants
 from gsisio_jax.paper.stability import Stability, stability
 from gsisio_jax.paper.widths import width_bounds
-from gsisio_jax.system import Noise, System
+from gsisio_jax.plant.system import Noise, System
 
 # Lemma 2 knows how wide these bounds of f and g can be; the others alone are sound, but of no known width.
 _OF_KNOWN_WIDTH = ("decomposition", "remainder", "mean_value")

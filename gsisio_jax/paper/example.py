@@ -12,11 +12,11 @@ import numpy as np
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.framer import framer_gains
 from gsisio_jax.examples import paper
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval.box import Interval
 from gsisio_jax.paper.lipschitz import PRINTED, LipschitzConstants, lipschitz_constants, spectral_norm
 from gsisio_jax.paper.stability import Stability, split_matrices, stability
 from gsisio_jax.paper.widths import WidthBounds, width_bounds
-from gsisio_jax.system import Noise
+from gsisio_jax.plant.system import Noise
 
 INPUTS = "d = (2 sin 0.2k, 1.5 cos 0.13k)"
 """The unknown input of `record`: the one in the paper's figures is not printed."""

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsisio_jax._extras import need
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval.box import Interval
 
 BOX, EDGE, TRUTH, WRONG, BOUND = "#88aadd", "#3366aa", "#111111", "#cc2233", "#bb5500"
 EMPTY, SILENT = "#ddaa66", "#dddddd"

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import inclusion
-from gsisio_jax.inclusion.decomposition import decomposition_gain, width_gain
-from gsisio_jax.interval import Interval
-from gsisio_jax.system import System
+from gsisio_jax.inclusion.mixed_monotone import decomposition_gain, width_gain
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.system import System
 
 _BATCH = 64  # boxes per call of the engine: one shape, one compilation
 _ROUNDS = 400

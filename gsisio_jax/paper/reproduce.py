@@ -14,16 +14,16 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gsisio_jax.certificate import Certificate
 from gsisio_jax.design.build import design_observer
-from gsisio_jax.estimation import estimate
 from gsisio_jax.examples import paper
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.certificate import Certificate
+from gsisio_jax.observer.estimation import estimate
+from gsisio_jax.observer.status import Status
 from gsisio_jax.paper.algorithm import gsisio
 from gsisio_jax.paper.example import INPUTS, Record, Row, initial, noise, numbers, printed_claim, record
 from gsisio_jax.paper.figures import Boxes, crossed, figure_2, figure_3
 from gsisio_jax.paper.lipschitz import PRINTED
-from gsisio_jax.status import Status
 
 REGION = Interval([-1.37, -2.1], [1.37, 2.1])
 """Region of the current form's design: its steady width fits, with room for the boxes to move."""

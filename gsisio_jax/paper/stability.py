@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsisio_jax.certificate import spectral_radius
 from gsisio_jax.design.framer import framer_gains
 from gsisio_jax.design.lmi import LmiAnswer, iss_lmi, printed_lmi
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.certificate import spectral_radius
 from gsisio_jax.paper.lipschitz import LipschitzConstants, lipschitz_constants, spectral_norm
-from gsisio_jax.system import Noise, System
+from gsisio_jax.plant.system import Noise, System
 
 _CUTOFF = 1e-10  # singular values below this share of the largest count as 0 in the pseudo-inverse
 

@@ -7,10 +7,10 @@ matplotlib is imported when a picture is drawn, never before.
 
 from __future__ import annotations
 
-from gsisio_jax.plot.boxes import framers, save
-from gsisio_jax.plot.closing import funnel
-from gsisio_jax.plot.lines import curves
-from gsisio_jax.plot.mesh import heatmap
-from gsisio_jax.plot.narrowing import widths
+from gsisio_jax.plot._curves import curves
+from gsisio_jax.plot._framers import framers, save
+from gsisio_jax.plot._funnel import funnel
+from gsisio_jax.plot._heatmap import heatmap
+from gsisio_jax.plot._widths import widths
 
 __all__ = ["curves", "framers", "funnel", "heatmap", "save", "widths"]

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax.observer.status import Status
 from gsisio_jax.plot.study import KINDS, axes_of, fixed, kept_kinds, prepared, time_of, variable_signals
-from gsisio_jax.status import Status
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.interval import Interval
-from gsisio_jax.system import Noise, System
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.system import Noise, System
 
 RUN = "run"  # the axis of arguments that have a leading batch axis and no name
 BLOCK = 1 << 16  # rows looked at together, so that checking a large record does not double it

@@ -17,7 +17,7 @@ from concurrent.futures import CancelledError
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gsisio_jax._extras import need
-from gsisio_jax.study.parcel import Parcel, compute_tile
+from gsisio_jax.study.worker import Parcel, compute_tile
 
 if TYPE_CHECKING:
     from gsisio_jax.study.job import Job, Results

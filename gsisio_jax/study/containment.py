@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.errors import ContainmentLost
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import StepOutput
-from gsisio_jax.study.reduce import Context, Kept, Variable
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.types import StepOutput
+from gsisio_jax.study.reduction_base import Context, Kept, Variable
 from gsisio_jax.study.truth import Coverage
 
 # The simulated plant rounds where the real one would not, so noise on its very bounds may push the truth out of a box

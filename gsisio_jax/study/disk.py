@@ -89,7 +89,7 @@ def failure(error: OSError, what: str, kept: str) -> StoreError:
 
 
 @contextlib.contextmanager
-def told(what: str, kept: str) -> Iterator[None]:
+def one_line_os_error(what: str, kept: str) -> Iterator[None]:
     """Turn an error of the operating system into one line that names the path and the remedy."""
     try:
         yield

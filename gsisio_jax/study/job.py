@@ -13,17 +13,16 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-import gsisio_jax
 from gsisio_jax._extras import need
-from gsisio_jax.estimation import AnyObserver
-from gsisio_jax.study import cluster
-from gsisio_jax.study import mesh as devices
+from gsisio_jax._version import __version__
+from gsisio_jax.observer.estimation import AnyObserver
+from gsisio_jax.study import cluster, devices
 from gsisio_jax.study.axes import Layout
+from gsisio_jax.study.certified_widths import along, beside, promised
 from gsisio_jax.study.kernel import fingerprint, outline, run_cases, tile_size
 from gsisio_jax.study.labels import Labels, coordinates_of, variables_of
-from gsisio_jax.study.promises import along, beside, promised
-from gsisio_jax.study.reduce import Reduction
-from gsisio_jax.study.rows import Rows
+from gsisio_jax.study.reduction_base import Reduction
+from gsisio_jax.study.row_source import Rows
 
 PATIENCE = 2.0  # seconds before a bar appears
 
@@ -45,7 +44,7 @@ class Job:
         size: cases per tile.
         shapes: of the results of one case.
         cost: bytes of working set of a case, where the size of a tile was chosen by it.
-        mesh: devices that share a tile, from `mesh.flat`.
+        mesh: devices that share a tile, from `devices.flat`.
     """
 
     call: str
@@ -193,7 +192,7 @@ def run(
         "guaranteed": observer.guaranteed,
         "steps": labels.steps,
         "tile": job.size,
-        "library": f"gsisio_jax {gsisio_jax.__version__}, jax {jax.__version__}",
+        "library": f"gsisio_jax {__version__}, jax {jax.__version__}",
     }
     if store is None:
         values = {name: np.empty((layout.cases, *v[0]), v[1]) for name, v in variables.items()}

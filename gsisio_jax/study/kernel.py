@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax import estimation
-from gsisio_jax.estimation import AnyObserver
+from gsisio_jax.observer import estimation
+from gsisio_jax.observer.estimation import AnyObserver
 from gsisio_jax.study.axes import bare
-from gsisio_jax.study.reduce import Context, Kept, Reduction
-from gsisio_jax.study.rows import Rows
+from gsisio_jax.study.reduction_base import Context, Kept, Reduction
+from gsisio_jax.study.row_source import Rows
 
 TARGET_BYTES = 256 * 2**20  # working set of a tile
 # What XLA holds for a step, in sizes of what the scan carries: 6.1 for two states with sines, 3.7 for four with roots

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from gsisio_jax.status import flag_attributes
+from gsisio_jax.observer.status import flag_attributes
+from gsisio_jax.plant.system import System
 from gsisio_jax.study.axes import Layout
-from gsisio_jax.study.reduce import Reduction, Variable
-from gsisio_jax.study.rows import Rows
-from gsisio_jax.system import System
+from gsisio_jax.study.reduction_base import Reduction, Variable
+from gsisio_jax.study.row_source import Rows
 
 
 class Labels(NamedTuple):

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax import estimation
 from gsisio_jax._extras import need
-from gsisio_jax.estimation import AnyObserver, OnConflict
-from gsisio_jax.interval import Interval
-from gsisio_jax.rounding import Rounding
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.rounding import Rounding
+from gsisio_jax.observer import estimation
+from gsisio_jax.observer.estimation import AnyObserver, OnConflict
+from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.axes import RUN, Axis, Layout, prepare
 from gsisio_jax.study.containment import Containment, TrueRun
 from gsisio_jax.study.job import Job, run
@@ -22,7 +23,6 @@ from gsisio_jax.study.plant import Simulated
 from gsisio_jax.study.reductions import resolve
 from gsisio_jax.study.summary import check_confidence, summary
 from gsisio_jax.study.truth import Coverage
-from gsisio_jax.system import Noise
 
 CALL = "monte_carlo"
 # Dimensions of every argument of one case.

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax import estimation
-from gsisio_jax.interval import Interval
-from gsisio_jax.simulation import measured, moved
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer import estimation
+from gsisio_jax.plant.simulation import measured, moved
 from gsisio_jax.study import containment
 from gsisio_jax.study.containment import BROKEN
-from gsisio_jax.study.reduce import Variable
-from gsisio_jax.study.rows import Row, Rows
+from gsisio_jax.study.reduction_base import Variable
+from gsisio_jax.study.row_source import Row, Rows
 
 
 @dataclass(frozen=True)

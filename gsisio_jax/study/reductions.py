@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.observer import StepOutput
-from gsisio_jax.status import Status
-from gsisio_jax.study.reduce import Context, Kept, Reduction, Variable
+from gsisio_jax.observer.status import Status
+from gsisio_jax.observer.types import StepOutput
+from gsisio_jax.study.reduction_base import Context, Kept, Reduction, Variable
 from gsisio_jax.study.truth import Coverage, Error
 
 

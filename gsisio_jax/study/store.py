@@ -32,8 +32,8 @@ from gsisio_jax.study.disk import (
     fill_value,
     flush_folder,
     is_empty,
+    one_line_os_error,
     put,
-    told,
 )
 from gsisio_jax.study.header import DONE, Header, checked, difference
 from gsisio_jax.study.reader import backend, for_netcdf
@@ -67,7 +67,7 @@ class TileStore:
         need("zarr", extra="study", purpose="storing a study")
         path, header = Path(path).absolute(), checked(header)
         store = cls(path, header)
-        with told(f"store: cannot create {path}", "nothing was written"):
+        with one_line_os_error(f"store: cannot create {path}", "nothing was written"):
             if (os.path.lexists(path) and not is_empty(path)) or not store._create():
                 if not resume:
                     raise ValueError(
@@ -92,7 +92,7 @@ class TileStore:
         """
         zarr = need("zarr", extra="study", purpose="reading a stored study")
         path = Path(path).absolute()
-        with told(f"store: cannot read {path}", "nothing was changed"):
+        with one_line_os_error(f"store: cannot read {path}", "nothing was changed"):
             try:
                 group = zarr.open_group(path, mode="r", zarr_format=3)
                 kept = dict(group.attrs)[KEY]
@@ -167,7 +167,7 @@ class TileStore:
             MissingExtra: xarray is not installed.
         """
         xarray = need("xarray", extra="study", purpose="the dataset of a study")
-        with told(f"store: cannot read {self.path}", "nothing was changed"):
+        with one_line_os_error(f"store: cannot read {self.path}", "nothing was changed"):
             finished = self._finished()
             if finished.all():
                 self._tidy(0.0)
@@ -186,7 +186,7 @@ class TileStore:
         for holder in (dataset, *dataset.variables.values()):
             holder.attrs = {name: for_netcdf(value) for name, value in holder.attrs.items() if value is not None}
         part = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PART}")
-        with told(f"store: cannot write {path}", "the store is as it was"):
+        with one_line_os_error(f"store: cannot write {path}", "the store is as it was"):
             try:
                 dataset.to_netcdf(part, engine="netcdf4")
                 with open(part, "rb+") as stream:
@@ -204,7 +204,7 @@ class TileStore:
 
     def _finished(self) -> np.ndarray:
         finished = np.zeros(self.tiles, dtype=bool)
-        with told(f"store: cannot read {self.path}", "nothing was changed"):
+        with one_line_os_error(f"store: cannot read {self.path}", "nothing was changed"):
             found = [
                 int(match[1]) for name in os.listdir(self.path / DONE) if (match := re.fullmatch(r"c\.(\d+)", name))
             ]

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from gsisio_jax import estimation
 from gsisio_jax._extras import need
-from gsisio_jax.estimation import AnyObserver, OnConflict
-from gsisio_jax.interval import Interval
-from gsisio_jax.rounding import Rounding
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.rounding import Rounding
+from gsisio_jax.observer import estimation
+from gsisio_jax.observer.estimation import AnyObserver, OnConflict
+from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.axes import Axis, Layout, bare, prepare
 from gsisio_jax.study.job import Job, run
 from gsisio_jax.study.labels import Labels
 from gsisio_jax.study.reductions import resolve
-from gsisio_jax.study.rows import Recorded
-from gsisio_jax.system import Noise
+from gsisio_jax.study.row_source import Recorded
 
 CALL = "sweep"
 

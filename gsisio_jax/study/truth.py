@@ -7,9 +7,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import StepOutput
-from gsisio_jax.study.reduce import Context, Reduction, Variable
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.types import StepOutput
+from gsisio_jax.study.reduction_base import Context, Reduction, Variable
 
 
 class _Truth(Reduction):

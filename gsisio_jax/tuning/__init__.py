@@ -9,8 +9,8 @@ from gsisio_jax.tuning.result import HeldOut, TunedNoise
 from gsisio_jax.tuning.sensitivity import width_sensitivity
 
 if TYPE_CHECKING:
-    from gsisio_jax.design.allocation import Allocation, allocate
-    from gsisio_jax.design.codesign import optimal_widths
+    from gsisio_jax.tuning.allocation import Allocation, allocate
+    from gsisio_jax.tuning.codesign import optimal_widths
 
 __all__ = [
     "Allocation",
@@ -33,4 +33,4 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib
 
-    return getattr(importlib.import_module(f"gsisio_jax.design.{_OFFLINE[name]}"), name)
+    return getattr(importlib.import_module(f"gsisio_jax.tuning.{_OFFLINE[name]}"), name)

@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsisio_jax.observer import Observer
-from gsisio_jax.system import Noise
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.plant.system import Noise
 from gsisio_jax.tuning import search as searching
 from gsisio_jax.tuning.identify import identify, is_affine
 from gsisio_jax.tuning.records import Records

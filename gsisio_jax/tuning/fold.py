@@ -13,10 +13,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax import estimation
-from gsisio_jax.estimation import AnyObserver, OnConflict
-from gsisio_jax.interval import Interval
-from gsisio_jax.system import Noise
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer import estimation
+from gsisio_jax.observer.estimation import AnyObserver, OnConflict
+from gsisio_jax.plant.system import Noise
 
 SHORT = 512  # steps up to which a record is one chunk
 

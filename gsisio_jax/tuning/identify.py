@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gsisio_jax import inclusion
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import Observer
-from gsisio_jax.system import System
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.plant.system import System
 
 
 class Evidence(NamedTuple):

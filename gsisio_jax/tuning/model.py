@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import inclusion
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import Observer
-from gsisio_jax.system import System
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.plant.system import System
 
 
 def with_model(observer: Observer, system: System) -> Observer:
@@ -74,6 +74,6 @@ def with_model(observer: Observer, system: System) -> Observer:
     return replace(
         changed,
         certificate=replace(certificate, growth=growth, implicit=implicit, input_state_before=before),
-        guard=replace(observer.guard, growth=growth, input_growth=before),
+        rounding_constants=replace(observer.rounding_constants, growth=growth, input_growth=before),
         region_inverse=jnp.linalg.inv(jnp.eye(n, dtype=growth.dtype) - implicit),
     )

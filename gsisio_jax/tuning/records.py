@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gsisio_jax.interval import Interval
-from gsisio_jax.system import System
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.system import System
 
 
 @dataclass(frozen=True)

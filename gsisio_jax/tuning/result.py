@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax._extras import need
-from gsisio_jax.system import Noise
+from gsisio_jax.plant.system import Noise
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax import estimation
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import Observer, cast
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer import estimation
+from gsisio_jax.observer.types import Observer, cast
 from gsisio_jax.tuning.compiled import quickly
 from gsisio_jax.tuning.fold import fold_rows
 from gsisio_jax.tuning.records import Records

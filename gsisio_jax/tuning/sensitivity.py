@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from gsisio_jax import estimation
 from gsisio_jax._extras import need
-from gsisio_jax.interval import Interval
-from gsisio_jax.observer import Observer
-from gsisio_jax.system import Noise, System
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer import estimation
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.plant.system import Noise, System
 from gsisio_jax.tuning.compiled import quickly
 from gsisio_jax.tuning.fold import fold_rows
 from gsisio_jax.tuning.model import with_model
@@ -152,7 +152,7 @@ def _certificate(observer: Observer, noise: Noise, model: Any, parameters: Any, 
     slope[:, : n + l] = np.concatenate([state, inputs])
     slope[:, n + l : n + l + n] = 0
     if model is not None:
-        from gsisio_jax.design.codesign import optimal_widths
+        from gsisio_jax.tuning.codesign import optimal_widths
 
         # The gain re-optimised: at the best gain terms cancel exactly, and a fixed one has a kink there.
         region = certificate.region

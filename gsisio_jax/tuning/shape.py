@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from gsisio_jax.interval import Interval
-from gsisio_jax.system import Noise
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.system import Noise
 
 Parameters = str | Mapping[str, Any]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gsisio_jax import rounding
+from gsisio_jax.interval import rounding
 
 sys.path.append(str(Path(__file__).parents[1] / "oracles"))
 

@@ -11,7 +11,7 @@ import systems
 import gsisio_jax as gx
 from gsisio_jax import Interval
 from gsisio_jax.design.abstraction import affine_abstraction
-from gsisio_jax.inclusion.methods import METHODS, bound
+from gsisio_jax.inclusion.intersection import METHODS, bound
 
 REGION = Interval([-1.5, -2.0], [1.0, 2.5])
 

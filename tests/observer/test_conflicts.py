@@ -11,7 +11,7 @@ import target as tg
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from gsisio_jax.estimation import collect, resume
+from gsisio_jax.observer.estimation import collect, resume
 
 ROUNDING = 1e-9
 K, JUMP = 30, 40.0

@@ -13,7 +13,7 @@ import systems
 from oracles.numpy_program import numpy_function
 
 import gsisio_jax as gx
-from gsisio_jax.recursion import advance, begin
+from gsisio_jax.observer.step import advance, begin
 
 STEPS = 25
 NAN = np.nan

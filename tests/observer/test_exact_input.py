@@ -9,9 +9,9 @@ from oracles.input_hull import feasibility_slack, input_hull
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from gsisio_jax.contraction import Evidence, Terms
-from gsisio_jax.interval import image
-from gsisio_jax.recursion import _exact_input
+from gsisio_jax.interval.box import image
+from gsisio_jax.observer.contractors import Evidence, Terms
+from gsisio_jax.observer.step import _exact_input
 
 
 def plant(input_bounds=None):

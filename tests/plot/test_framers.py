@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from gsisio_jax import dataset, plot
-from gsisio_jax.alarms import Alarm
 from gsisio_jax.interval import Interval
-from gsisio_jax.plot.boxes import thinned
+from gsisio_jax.observer.alarms import Alarm
+from gsisio_jax.observer.status import Status
+from gsisio_jax.plot._framers import thinned
 from gsisio_jax.plot.style import MAXIMUM_POINTS
-from gsisio_jax.status import Status
 
 STEPS = 30
 

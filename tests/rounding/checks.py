@@ -17,7 +17,7 @@ from oracles.real_functions import FUNCTIONS
 from sampling import boxes, points
 
 from gsisio_jax import Interval, inclusion
-from gsisio_jax.rounding import Rounding
+from gsisio_jax.interval.rounding import Rounding
 
 MOST_BALLS = 1000  # numbers of one kind and batch that are decided by balls
 

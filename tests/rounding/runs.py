@@ -15,7 +15,7 @@ from plants import LINEAR, NONLINEAR, QUADRATIC, linear_observer, nonlinear_obse
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from gsisio_jax.rounding import Rounding
+from gsisio_jax.interval.rounding import Rounding
 
 
 @dataclass

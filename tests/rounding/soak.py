@@ -18,7 +18,7 @@ from plants import LINEAR, NONLINEAR, QUADRATIC
 from runs import Runs, estimator, run
 
 from gsisio_jax import Interval, inclusion, linear_image
-from gsisio_jax.rounding import Rounding
+from gsisio_jax.interval.rounding import Rounding
 
 BOXES, POINTS = 8192, 24
 # Whose oracle is slow: fewer boxes.

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gsisio_jax import Interval, inclusion, linear_image, rounding
-from gsisio_jax.residuals import exact, upper_inverse
+from gsisio_jax import Interval, inclusion, linear_image
+from gsisio_jax.interval import rounding
+from gsisio_jax.observer.residuals import exact, upper_inverse
 
 DTYPES = [np.float64, np.float32]
 

@@ -26,8 +26,8 @@ import gsisio_jax as gx
 from gsisio_jax.errors import ContainmentLost
 from gsisio_jax.study import cluster as cluster_module
 from gsisio_jax.study.job import Job
-from gsisio_jax.study.parcel import Parcel, Setting
 from gsisio_jax.study.store import TileStore
+from gsisio_jax.study.worker import Parcel, Setting
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")

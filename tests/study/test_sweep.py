@@ -16,7 +16,7 @@ import gsisio_jax as gx
 from gsisio_jax.study import Context, Kept, Reduction, Variable, quantiles, settle
 from gsisio_jax.study.kernel import fingerprint, tile_size
 from gsisio_jax.study.reductions import _quantiles, resolve
-from gsisio_jax.study.rows import Recorded
+from gsisio_jax.study.row_source import Recorded
 
 T = 14
 RECORDS, BOXES = 4, 2

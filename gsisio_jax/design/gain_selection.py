@@ -1,0 +1,117 @@
+"""Which gains an observer keeps: the certified one, gains for other box sizes, and gains for missing measurements."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+
+from gsisio_jax.design.feedthrough import Feedthrough
+from gsisio_jax.design.gains import improve, optimal_gain, profile_gain
+from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.errors import NoDesignFound
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.certificate import spectral_radius
+
+_MOST_OUTPUTS_FOR_ALL_PATTERNS = 4  # 2^4 patterns of missing entries get a gain each; beyond, one entry at a time
+
+
+def main_gain(problem: GainProblem, region: Interval) -> np.ndarray:
+    """The certified gain if there is one; else the gain that keeps boxes of a typical width smallest."""
+    scale = typical_width(problem, region)
+    gain = optimal_gain(problem, np.ones(problem.n), scale)
+    if gain is not None and np.isfinite(problem.steady_width(gain)).all():
+        # Solve once more in units of the answer: states of very different size are then equally accurate.
+        again = optimal_gain(problem, np.ones(problem.n), units(problem.steady_width(gain)))
+        if again is not None and (problem.steady_width(again) <= problem.steady_width(gain)).all():
+            gain = again
+        return improve(problem, gain)
+    # No gain contracts. Widths of the cheapest gains over a few steps are the profile to be good at.
+    everything = np.full(problem.columns, True)
+    width, gain = scale, None
+    for _ in range(3):
+        gain = profile_gain(problem, width, everything, units(width))
+        if gain is None:
+            break
+        width = problem.row_cost(gain, width)
+    if gain is None:
+        raise NoDesignFound(
+            "design_observer: the linear program for the gain has no solution although the rank condition holds; the "
+            "problem is badly scaled. Choose units in which states, outputs and noise have similar size."
+        )
+    if spectral_radius(problem.implicit(gain)) >= 1 - 1e-9:
+        raise NoDesignFound(
+            "design_observer: on this region the output is too nonlinear for the gain: rho(|N_z| R) = "
+            f"{spectral_radius(problem.implicit(gain)):.3g} >= 1, so the box of x[k] would not be finite. What may "
+            "help: a smaller region, or `state_bounds`."
+        )
+    return gain
+
+
+def profile_bank(problem: GainProblem, main: np.ndarray, region: Interval, count: int) -> list[np.ndarray]:
+    """Gains that are best, row by row, for boxes from well below the steady width up to the region (log-spaced).
+
+    Smaller ones too: the intersection of a bank is narrower than the steady width of any one gain.
+    """
+    if count <= 0:
+        return []
+    steady = problem.steady_width(main)
+    steady = units(steady) if np.isfinite(steady).all() else typical_width(problem, region)
+    width = np.asarray(region.width)
+    largest = np.where(np.isfinite(width), np.maximum(width / steady, 2.0), 100.0)
+    everything = np.full(problem.columns, True)
+    found = []
+    for share in np.linspace(-1, 1, count):
+        profile = steady * np.where(share < 0, 100.0, largest) ** share
+        found.append(profile_gain(problem, profile, everything, units(profile)))
+    return [gain for gain in found if gain is not None]
+
+
+def gains_for_missing(
+    problem: GainProblem, main: np.ndarray, region: Interval, feedthrough: Feedthrough
+) -> list[np.ndarray]:
+    """Gains for steps in which y[k-1] or entries of y[k] are missing (design 4.6)."""
+    l, q = problem.l, problem.q
+    width = np.asarray(region.width)
+    steady = problem.steady_width(main)
+    typical = np.where(np.isfinite(steady), 4 * units(steady), typical_width(problem, region))
+    width = np.where(np.isfinite(width), width, typical)
+    support = feedthrough.T2 != 0
+    if l <= _MOST_OUTPUTS_FOR_ALL_PATTERNS:
+        present = [set(kept) for size in range(l + 1) for kept in combinations(range(l), size)]
+    else:
+        present = [set(), *(set(range(l)) - {j} for j in range(l)), set(range(l))]
+    found = []
+    for before in (False, True):
+        for kept in present:
+            usable = np.full(problem.columns, True)
+            usable[:l] = before
+            usable[l : l + q] = [set(np.flatnonzero(row)) <= kept for row in support]
+            if not before or len(kept) < l:
+                found.append(profile_gain(problem, width, usable, units(width)))
+    return [gain for gain in found if gain is not None]
+
+
+def distinct(bank: list[np.ndarray]) -> list[np.ndarray]:
+    """Drop gains that repeat an earlier one; keep the first, certified one in front."""
+    kept: list[np.ndarray] = []
+    for gain in bank:
+        if not any(
+            np.allclose(gain, other, rtol=1e-7, atol=1e-12) and ((gain != 0) == (other != 0)).all() for other in kept
+        ):
+            kept.append(gain)
+    return kept
+
+
+def typical_width(problem: GainProblem, region: Interval) -> np.ndarray:
+    """A first guess of the width of the boxes, (n,): from the region, else from what the outputs resolve."""
+    width = np.asarray(region.width)
+    with np.errstate(all="ignore"):
+        resolved = np.abs(np.linalg.pinv(problem.E)) @ problem.dv + problem.dw if problem.l else problem.dw
+    return np.where(np.isfinite(width) & (width > 0), width, units(resolved))
+
+
+def units(width: np.ndarray) -> np.ndarray:
+    """Widths as units: zeros become a share of the largest."""
+    largest = width.max(initial=0.0)
+    return np.maximum(width, 1e-3 * largest) if largest > 0 else np.ones_like(width)

@@ -1,0 +1,1 @@
+"""What every primitive does to bounds; `registry` says which rule belongs to which primitive."""

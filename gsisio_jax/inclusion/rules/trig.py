@@ -1,0 +1,119 @@
+"""Sine and cosine on an interval: exact ranges, and what is left after a slope is taken off.
+
+Source: design 5 and 6.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.inclusion.rules.sincos import LIMIT, SLOT, sin_cos
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, choose
+from gsisio_jax.interval.minmax import larger, smaller
+from gsisio_jax.interval.xla import once
+
+_PERIOD = 6.28  # a little less than 2 pi
+
+
+class _WaveParts(NamedTuple):
+    """Is the interval usable; its middle m and half-width r; sine and cosine of m and of r / 2."""
+
+    usable: Any
+    m: Any
+    r: Any
+    sine: Any
+    cosine: Any
+    half_sin: Any
+    half_cos: Any
+
+
+@dataclass(frozen=True)
+class Wave:
+    """``sin`` or ``cos``.
+
+    Everything follows from the middle m and the half-width r alone: ``phi(m + h) = phi(m) cos h + phi'(m) sin h``.
+    Range and line then share four sines and cosines, which are what a wave costs.
+    """
+
+    cosine: bool
+
+    def parts(self, a: Any, b: Any) -> _WaveParts:
+        """What all three need."""
+        usable, m, r = _middle(a, b)
+        return _WaveParts(usable, m, r, *sin_cos(m), *sin_cos(0.5 * r))
+
+    def range(self, a: Any, b: Any, parts: _WaveParts | None = None) -> Interval:
+        return _wave_range(self.cosine, 1.0, parts or self.parts(a, b))
+
+    def near(self, a: Any, b: Any) -> Interval:
+        """As good as `range` on thin boxes: slopes are at most 1, so no value is farther than r from that
+        in the middle. What m, r and that value lose is part of what `_wave_padded` counts."""
+        usable, m, r = _middle(a, b)
+        value, radius = sin_cos(m)[self.cosine], r
+        if rounding.outward():
+            radius = r + rounding.error(abs(m) + r + (1.0 if self.cosine else 0.0), 8 * SLOT)
+        radius = jnp.where(usable, radius, 2)
+        return Interval.unchecked(larger(value - radius, -1), smaller(value + radius, 1))
+
+    def derivative(self, a: Any, b: Any, parts: _WaveParts | None = None) -> Interval:
+        return _wave_range(not self.cosine, -1.0 if self.cosine else 1.0, parts or self.parts(a, b))
+
+    def line(self, a: Any, b: Any, natural: Interval, parts: _WaveParts | None = None) -> tuple[Any, Interval]:
+        usable, m, r, sine, cosine, half_sin, half_cos = parts or self.parts(a, b)
+        value, steepness = (cosine, -sine) if self.cosine else (sine, cosine)
+        # With slope phi'(m) cos(r/2) the odd part of the rest, sin h - h cos(r/2), has its critical points at
+        # +-r/2. It is then four times smaller than with the tangent, and no arccosine is needed.
+        s = steepness * half_cos
+        odd = jnp.abs(steepness) * larger(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
+        even = value * (1 - 2 * half_sin**2)
+        shift = s * m
+        lower, upper = smaller(value, even) - odd - shift, larger(value, even) + odd - shift
+        rest = _wave_padded(Interval.unchecked(lower, upper), self.cosine, m, r)
+        return jnp.where(usable, s, 0), choose(usable, rest, natural)
+
+
+def _middle(a: Any, b: Any) -> tuple[Any, Any, Any]:
+    """Is [a, b] within less than a period and near enough for `sin_cos`; middle and half-width, 0 where it is not."""
+    m, r = 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
+    usable = (r < 0.5 * _PERIOD) & (abs(m) + r < LIMIT[a.dtype.name])  # not where either is infinite or NaN
+    return usable, once(jnp.where(usable, m, 0)), once(jnp.where(usable, r, 0))
+
+
+def _wave_padded(exact: Interval, cosine: bool, m: Any, r: Any) -> Interval:
+    """Outward by what the formulas of `Wave` lose.
+
+    With SLOT = 2, `sin_cos` is off by 2 eps at most, and by ``3 eps |t|`` in the sine. m and r are off by ``eps (|m| +
+    r)`` together, and the derivative of every bound here by m or r is at most 2 in magnitude. Every product of two or
+    three such values, and sum of three, stays below ``14 eps (k + |m| + r)``, k = 1 for a cosine and 0 for a sine,
+    which vanishes with m and r. A crest that rounding hides lies within ``4 eps (|m| + r)`` of an end: half of the
+    square of that is what the value there misses, below ``eps`` times this again within `LIMIT`.
+    """
+    if not rounding.outward():
+        return exact
+    size = abs(m) + r + (1.0 if cosine else 0.0)
+    radius = rounding.error(size, 8 * SLOT)
+    return Interval.unchecked(exact.lower - radius, exact.upper + radius)
+
+
+def crosses(phase: float, period: float, a: Any, b: Any) -> Any:
+    """Does ``[a, b]`` contain ``phase + k period``?"""
+    return jnp.ceil((a - phase) / period) <= (b - phase) / period
+
+
+def _wave_range(cosine: bool, sign: float, parts: _WaveParts) -> Interval:
+    """Range of ``sign`` times the sine or the cosine."""
+    usable, m, r, sine, other, half_sin, half_cos = parts
+    value, steepness = (other, sine) if cosine else (sine, other)
+    even, odd = sign * value * (1 - 2 * half_sin**2), jnp.abs(steepness) * 2 * half_sin * half_cos
+    a, b = m - r, m + r
+    crest = (0.0 if cosine else np.pi / 2) + (np.pi if sign < 0 else 0.0)
+    top = ~usable | crosses(crest, 2 * np.pi, a, b)
+    bottom = ~usable | crosses(crest + np.pi, 2 * np.pi, a, b)
+    found = _wave_padded(Interval.unchecked(even - odd, even + odd), cosine, m, r)
+    lower, upper = jnp.where(bottom, -1, found.lower), jnp.where(top, 1, found.upper)
+    return Interval.unchecked(jnp.maximum(lower, -1), jnp.minimum(upper, 1))

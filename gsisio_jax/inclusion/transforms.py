@@ -1,0 +1,252 @@
+"""The four ways to bound a function on a box: ranges, affine forms, Jacobians, mean-value form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from gsisio_jax.inclusion.form_arithmetic import guard, is_known, is_point, product, shift, slope_image, sum_slack
+from gsisio_jax.inclusion.interpreter import evaluate
+from gsisio_jax.inclusion.node import POINT_MODE, Domain, Form, Node, as_node, is_node, jac_of, slack_of, slope_of
+from gsisio_jax.interval.box import Interval, choose
+from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
+from gsisio_jax.interval.xla import add_up
+
+
+class AffineForm(eqx.Module):
+    """Bounds of f on a box X of shape (n,): a linear part, an offset box, and a range.
+
+    For every x in X, ``f(x) - slope @ x`` lies in `offset`, and ``f(x)`` in `range`.
+
+    Attributes:
+        slope: shape (*out, n), finite.
+        offset: box of shape (*out).
+        range: box of shape (*out), the natural bounds met with the affine ones at every node of f.
+
+    Source: design 5.
+    """
+
+    slope: Float[Array, "*out n"]
+    offset: Interval
+    range: Interval
+
+    def over(self, box: Interval) -> Interval:
+        """Bounds of f on a box inside X, from slope and offset alone; shape (*out)."""
+        slope = jnp.moveaxis(jnp.asarray(self.slope), -1, 0)
+        return guard(shift(slope_image(slope, box.astype(slope.dtype)), self.offset))
+
+
+def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
+    """Natural inclusion function of f: every operation replaced by its range.
+
+    Args:
+        f: takes an array of shape (n,), then any number of further arguments; returns an array of any shape.
+        rounding: "outward" (what None means, too) for bounds that hold on the machine; "nearest" is faster, and its
+            bounds hold up to rounding errors only. A constant expression in f counts as the number it evaluates to.
+
+    Returns:
+        A function of a box (n,) and of the further arguments, arrays or boxes (the result then holds for all of
+        their values), that returns an `Interval` of the shape of f's result, containing every value f takes.
+
+    Raises:
+        UnknownPrimitiveError: f uses an operation without known bounds.
+        ValueError: the first argument is no box of shape (n,).
+
+    >>> natural(lambda x: jnp.sqrt(x[0]) - x[1], rounding="nearest")(Interval([0.0, 1.0], [4.0, 2.0]))
+    Interval(-2.0, 1.0)
+
+    Source: design 5.
+    """
+
+    @rounded_by("inclusion.natural", rounding)
+    def bounds(box: Interval, *args: Any) -> Any:
+        box = _typed("natural", box, args)
+        if not is_point(box):
+            return _run(f, Node(box), args, _finish_range)
+        token = POINT_MODE.set(True)
+        try:
+            return _run(f, _variable(box), args, _finish_range)
+        finally:
+            POINT_MODE.reset(token)
+
+    return bounds
+
+
+def affine(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
+    """Affine bounds of f: a function of a box (n,) and of f's further arguments that returns an `AffineForm`.
+
+    Arguments and errors are those of `natural`. Exact, with an offset of width 0, where f is affine; infinite boxes
+    are legal, and the offset stays finite where a finite one exists for the chosen slope.
+
+    >>> form = affine(lambda x: 2 * x[0] + jnp.sin(x[1]), rounding="nearest")(Interval.entire(2))
+    >>> form.slope.tolist(), form.offset
+    ([2.0, 0.0], Interval(-1.0, 1.0))
+
+    Source: design 5.
+    """
+
+    @rounded_by("inclusion.affine", rounding)
+    def bounds(box: Interval, *args: Any) -> Any:
+        box = _typed("affine", box, args)
+        return _run(f, _variable(box), args, lambda node: _finish_affine(node, box))
+
+    return bounds
+
+
+def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
+    """Enclosure of the Jacobian of f: a function of a box (n,) and of f's further arguments.
+
+    It returns an `Interval` of shape (*out, n) that contains the derivative at every point of the box where f has
+    one, and every difference quotient: for a and b in the box, ``f(a) - f(b)`` lies in J (a - b). So where f may
+    jump inside the box the bounds are infinite, and where it has a kink they are the hull of both sides.
+    Arguments and errors are those of `natural`.
+
+    >>> jacobian(lambda x: jnp.abs(x[0]) + 3 * x[1], rounding="nearest")(Interval([-1.0, 0.0], [1.0, 1.0]))
+    Interval([-1.  3.], [1. 3.])
+
+    Source: design 5.
+    """
+
+    @rounded_by("inclusion.jacobian", rounding)
+    def bounds(box: Interval, *args: Any) -> Any:
+        box = _typed("jacobian", box, args)
+        return _run(f, _variable(box, derivative=True), args, lambda node: _finish_jacobian(node, box))
+
+    return bounds
+
+
+def mean_value(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
+    """Mean-value form ``f(c) + J (box - c)`` around the center c of the box; arguments and errors as `natural`.
+
+    Source: design 5.
+    """
+    at, slope = natural(f), jacobian(f)
+
+    @rounded_by("inclusion.mean_value", rounding)
+    def bounds(box: Interval, *args: Any) -> Any:
+        box = _typed("mean_value", box, args)
+        center = box.center
+        around = distance(box, center)
+        middle, enclosure = at(Interval.unchecked(center, center), *args), slope(box, *args)
+
+        def combine(value: Interval, jac: Interval) -> Interval:
+            moved = product(jac, around)
+            return guard(shift(value, Interval.unchecked(sum_down(moved.lower), sum_up(moved.upper))))
+
+        return jax.tree.map(combine, middle, enclosure, is_leaf=lambda v: isinstance(v, Interval))
+
+    return bounds
+
+
+def distance(box: Interval, point: Any) -> Interval:
+    """Bounds of ``x - point`` over the box."""
+    lower, upper = down(box.lower - point), up(box.upper - point)
+    # A side on which the box ends at the point itself is exactly 0.
+    return Interval.unchecked(jnp.where(box.lower == point, 0, lower), jnp.where(box.upper == point, 0, upper))
+
+
+def _typed(call: str, box: Any, args: tuple[Any, ...]) -> Interval:
+    """The box in the floating type of the computation, rounded outward where that is narrower."""
+    if not isinstance(box, Interval) or len(box.shape) != 1:
+        got = f"a box of shape {box.shape}" if isinstance(box, Interval) else repr(box)
+        raise ValueError(f"inclusion.{call}: the first argument must be an Interval of shape (n,), got {got}")
+    return box.astype(_dtype(box, args))
+
+
+def _dtype(box: Interval, args: tuple[Any, ...]) -> Any:
+    leaves = [leaf for leaf in jax.tree.leaves(args) if jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)]
+    return jnp.result_type(box.lower, box.upper, *leaves)
+
+
+def _variable(box: Interval, derivative: bool = False) -> Node:
+    eye = np.eye(box.lower.shape[0], dtype=box.lower.dtype)
+    zero = np.zeros(box.shape, box.lower.dtype)
+    jac = Interval.unchecked(eye, eye) if derivative else None
+    return Node(box, Form(eye, Interval.unchecked(zero, zero), Domain.of(box)), jac)
+
+
+def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable[[Any], Any]) -> Any:
+    """Trace f on shapes alone, interpret what comes out, and give the results f's own structure."""
+
+    def is_box(value: Any) -> bool:
+        return isinstance(value, Interval)
+
+    def convert(arg: Any) -> Any:
+        if is_box(arg):
+            return Node(arg.astype(x.dtype))
+        arg = jnp.asarray(arg)
+        return arg.astype(x.dtype) if jnp.issubdtype(arg.dtype, jnp.floating) else arg
+
+    values = jax.tree.map(convert, args, is_leaf=is_box)
+    shapes = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), values, is_leaf=is_node)
+    closed, out = jax.make_jaxpr(f, return_shape=True)(jax.ShapeDtypeStruct(x.shape, x.dtype), *shapes)
+    inputs = [x, *jax.tree.leaves(values, is_leaf=is_node)]
+    results = evaluate(closed.jaxpr, closed.consts, inputs)
+    nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
+    nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
+    return jax.tree.unflatten(jax.tree.structure(out), [finish(_in_type(node, x.dtype)) for node in nodes])
+
+
+def _in_type(node: Node, dtype: Any) -> Node:
+    """What a constant of f has promoted comes back in the type of the box, rounded outward."""
+    if node.dtype == dtype:
+        return node
+    form = node.form
+    if form is not None:
+        slope = jnp.asarray(form.slope).astype(dtype)
+        lost = abs(slope) * np.dtype(dtype).type(2 * jnp.finfo(dtype).eps)
+        slack = sum_slack(lost, None if form.slack is None else (2 * form.slack).astype(dtype))
+        domain = Domain(*(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.reach)))
+        form = Form(slope, form.offset.astype(dtype), domain, slack)
+    return Node(node.range.astype(dtype), form, None if node.jac is None else node.jac.astype(dtype))
+
+
+def _as_numbers(node: Node, dtype: Any) -> Node:
+    """Truth values that leave f count as 0 and 1."""
+    return Node(Interval.unchecked(node.range.lower.astype(dtype), node.range.upper.astype(dtype)), None, node.jac)
+
+
+def _finish_range(node: Node) -> Interval:
+    return guard(node.range)
+
+
+def _finish_affine(node: Node, box: Interval) -> AffineForm:
+    slope, offset = slope_of(node, Domain.of(box)), guard(node.offset if node.form is None else node.form.folded())
+    # Slopes that overflowed say nothing: slope 0 does.
+    bounds = guard(node.range)
+    if is_known(slope):
+        return AffineForm(jnp.asarray(np.moveaxis(slope, 0, -1)), jax.tree.map(jnp.asarray, offset), bounds)
+    good = jnp.isfinite(add_up(jnp.abs(slope), 0))
+    return AffineForm(jnp.moveaxis(jnp.where(good, slope, 0), 0, -1), choose(good, offset, bounds), bounds)
+
+
+def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
+    """`affine`, but the offset belongs to a slope that is known to within a slack only, returned beside: (*out, n).
+
+    On infinite boxes that is more than an offset which holds for the slope as it stands.
+    """
+
+    def bounds(box: Interval, *args: Any) -> Any:
+        box = _typed("affine", box, args)
+
+        def finish(node: Node) -> tuple[AffineForm, Any]:
+            slope = slope_of(node, Domain.of(box))
+            slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
+            good, bounds = jnp.isfinite(add_up(abs(slope))), guard(node.range)
+            slope, slack = (jnp.where(good[..., None], v, 0) for v in (slope, slack))
+            return AffineForm(slope, choose(good, guard(node.offset), bounds), bounds), slack
+
+        return _run(f, _variable(box), args, finish)
+
+    return bounds
+
+
+def _finish_jacobian(node: Node, box: Interval) -> Interval:
+    jac = guard(jac_of(node, box.lower.shape[0]))
+    return Interval.unchecked(jnp.moveaxis(jac.lower, 0, -1), jnp.moveaxis(jac.upper, 0, -1))

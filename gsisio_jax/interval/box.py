@@ -1,0 +1,364 @@
+"""Boxes: the one data type that every other module passes around.
+
+A box is a pair of arrays ``lower <= upper`` of equal shape. Infinite sides are legal (a half-line, all of R^n); NaN and
+crossed bounds are not. Arithmetic here follows the conventions of interval analysis: ``0 * inf = 0``, and no operation
+on legal boxes returns NaN. Results are rounded outward (see `rounding`). Everything is differentiable: infinite sides
+never enter a product that a gradient flows through, because ``0 * inf`` in a backward pass would be NaN.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.minmax import larger, smaller
+from gsisio_jax.interval.xla import add_up, once
+
+
+def is_concrete(value: Any) -> bool:
+    """True where the numbers of an array can be looked at (no tracer)."""
+    return not isinstance(value, Tracer)
+
+
+def _as_float_array(value: Any, call: str, name: str) -> Any:
+    """Keep JAX floating arrays; turn everything else into a float64 NumPy array, so that nothing is rounded here."""
+    if isinstance(value, (jax.Array, np.ndarray)) and jnp.issubdtype(value.dtype, jnp.floating):
+        return value
+    if isinstance(value, jax.Array):
+        return value.astype(jnp.result_type(float))
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{call}: `{name}` must be an array of real numbers, got {value!r}") from error
+
+
+class Interval(eqx.Module):
+    """A box ``[lower, upper]``, elementwise; a pytree.
+
+    Args:
+        lower: lower bounds, any shape, ``-inf`` allowed.
+        upper: upper bounds, same shape (scalars broadcast), ``inf`` allowed.
+
+    Numbers of 64 bits are rounded outward to 32 at once where JAX knows only those (`jax_enable_x64` is off): JAX
+    itself would round them to nearest, inward half of the time, as soon as the box enters a compiled function.
+
+    Raises:
+        ValueError: shapes do not agree, a bound is NaN, ``lower`` is ``+inf`` or ``upper`` is ``-inf``, or
+            ``lower > upper`` somewhere. Values are checked on concrete arrays only.
+
+    >>> box = Interval([-1.0, 0.0], [1.0, 4.0])
+    >>> box.center.tolist(), box.width.tolist()
+    ([0.0, 2.0], [2.0, 4.0])
+
+    Source: design 2; paper, Definition 1.
+    """
+
+    lower: Any
+    upper: Any
+
+    def __init__(self, lower: Any, upper: Any):
+        lower = _as_float_array(lower, "Interval", "lower")
+        upper = _as_float_array(upper, "Interval", "upper")
+        if lower.shape != upper.shape:
+            try:
+                shape = np.broadcast_shapes(lower.shape, upper.shape)
+            except ValueError as error:
+                raise ValueError(
+                    f"Interval: `lower` has shape {lower.shape} and `upper` has shape {upper.shape}; "
+                    "give both the same shape"
+                ) from error
+            lower, upper = (x if x.shape == shape else _broadcast(x, shape) for x in (lower, upper))
+        if is_concrete(lower) and is_concrete(upper):
+            _check_values(np.asarray(lower), np.asarray(upper))
+        self.lower = _representable(lower, -np.inf)
+        self.upper = _representable(upper, np.inf)
+
+    @classmethod
+    def unchecked(cls, lower: Any, upper: Any) -> Interval:
+        """Build without looking at the numbers: for bounds that are ordered by construction."""
+        self = object.__new__(cls)
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+        return self
+
+    @classmethod
+    def point(cls, value: Any) -> Interval:
+        """The box that holds one value only."""
+        return cls(value, value)
+
+    @classmethod
+    def symmetric(cls, radius: Any) -> Interval:
+        """The box ``[-radius, radius]``."""
+        radius = _as_float_array(radius, "Interval.symmetric", "radius")
+        return cls(-radius, radius)
+
+    @classmethod
+    def entire(cls, shape: int | tuple[int, ...]) -> Interval:
+        """All of R^shape: nothing is known."""
+        return cls(np.full(shape, -np.inf), np.full(shape, np.inf))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of both bounds."""
+        return self.lower.shape
+
+    @property
+    def dtype(self) -> Any:
+        """Floating type of both bounds together."""
+        return jnp.result_type(self.lower, self.upper)
+
+    @property
+    def center(self) -> Any:
+        """Middle of the box; the finite side where one side is infinite, 0 where both are. Never NaN."""
+        xp = _namespace(self.lower, self.upper)
+        low, high = xp.isfinite(self.lower), xp.isfinite(self.upper)
+        a, b = xp.where(low, self.lower, 0.0), xp.where(high, self.upper, 0.0)
+        return xp.where(low & high, 0.5 * a + 0.5 * b, a + b)
+
+    @property
+    def width(self) -> Any:
+        """``upper - lower``, ``inf`` where a side is infinite."""
+        return self.upper - self.lower
+
+    @property
+    def radius(self) -> Any:
+        """Half the width."""
+        return 0.5 * self.width
+
+    def __getitem__(self, index: Any) -> Interval:
+        return Interval.unchecked(self.lower[index], self.upper[index])
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    def contains(self, value: Any, margin: float = 0.0) -> Any:
+        """Elementwise: is ``value`` inside, with `margin` to spare?"""
+        return (self.lower + margin <= value) & (value <= self.upper - margin)
+
+    def astype(self, dtype: Any) -> Interval:
+        """The smallest box of that floating type that contains this one (a narrowing cast rounds outward)."""
+        lower = cast_down(self.lower, dtype)
+        if self.lower is self.upper and self.lower.dtype == lower.dtype:  # known to be a point: that stays known
+            return Interval.unchecked(*rounding.normal(lower, lower))
+        upper = cast_up(self.upper, dtype)
+        return Interval.unchecked(*rounding.normal(lower, upper))
+
+    def __repr__(self) -> str:
+        if is_concrete(self.lower) and is_concrete(self.upper):
+            return f"Interval({np.asarray(self.lower)}, {np.asarray(self.upper)})"
+        return f"Interval({self.lower}, {self.upper})"
+
+
+def _namespace(*values: Any) -> Any:
+    return np if all(isinstance(value, np.ndarray | np.generic) for value in values) else jnp
+
+
+def _representable(value: Any, towards: float) -> Any:
+    """A host array that JAX would round when it sees it, rounded outward before."""
+    dtype = jax.dtypes.canonicalize_dtype(value.dtype)
+    return value if isinstance(value, jax.Array) or value.dtype == dtype else np.asarray(_cast(value, dtype, towards))
+
+
+def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
+    return _namespace(value).broadcast_to(value, shape)
+
+
+def _check_values(lower: np.ndarray, upper: np.ndarray) -> None:
+    for name, value in (("lower", lower), ("upper", upper)):
+        if np.isnan(value).any():
+            where = np.argwhere(np.isnan(value))[0].tolist()
+            raise ValueError(f"Interval: `{name}` is NaN at index {where}; use -inf or inf for an unknown bound")
+    bad = (lower > upper) | (lower == np.inf) | (upper == -np.inf)
+    if bad.any():
+        where = tuple(np.argwhere(bad)[0])
+        raise ValueError(
+            f"Interval: bounds cross at index {[int(i) for i in where]}: lower = {lower[where]}, "
+            f"upper = {upper[where]}; give lower <= upper, finite or infinite outward"
+        )
+
+
+def _cast(value: Any, dtype: Any, towards: float) -> Any:
+    dtype = jax.dtypes.canonicalize_dtype(dtype)
+    if value.dtype == dtype:
+        return jnp.asarray(value)
+    tiny = float(jnp.finfo(dtype).tiny)
+    if isinstance(value, np.ndarray | np.generic):
+        # On the host, before JAX sees the number: with 64-bit types off, JAX itself would round to nearest.
+        exact: Any = value
+        with np.errstate(all="ignore"):
+            cast = np.asarray(exact, dtype)
+            wrong = cast > exact if towards < 0 else cast < exact
+            moved = np.nextafter(cast, np.asarray(towards, dtype))
+            # Compiled code takes subnormal numbers for zero: they are no bounds.
+            moved = np.where(np.abs(moved) < tiny, np.copysign(tiny, towards), moved)
+            return jnp.asarray(np.where(wrong, moved, cast), dtype)
+    cast = value.astype(dtype)
+    if jnp.finfo(dtype).bits >= jnp.finfo(value.dtype).bits:
+        return cast
+    back = cast.astype(value.dtype)
+    wrong = back > value if towards < 0 else back < value
+    # nextafter has no derivative rule: add its step as a constant, so that gradients see a plain cast.
+    fixed = jax.lax.stop_gradient(cast)
+    step = jax.lax.stop_gradient(jnp.nextafter(fixed, jnp.asarray(towards, dtype)) - fixed)
+    largest = jnp.finfo(dtype).max if towards < 0 else jnp.finfo(dtype).min
+    moved = jnp.where(jnp.isfinite(fixed), cast + jnp.where(jnp.isfinite(step), step, 0), largest)
+    moved = jnp.where(abs(fixed) <= tiny, jnp.copysign(2 * tiny, towards), moved)
+    return jnp.where(wrong, moved, cast)
+
+
+def cast_down(value: Any, dtype: Any) -> Any:
+    """Cast to `dtype`, towards minus infinity where the number does not fit."""
+    return _cast(value, dtype, -np.inf)
+
+
+def cast_up(value: Any, dtype: Any) -> Any:
+    """Cast to `dtype`, towards infinity where the number does not fit."""
+    return _cast(value, dtype, np.inf)
+
+
+@jax.custom_jvp
+def scale(factor: Any, value: Any) -> Any:
+    """``factor * value`` with ``0 * inf = 0``, for finite factors; finite gradients even where `value` is infinite."""
+    factor, value = jnp.asarray(factor), jnp.asarray(value)
+    return jnp.where(factor == 0, 0, factor * value)
+
+
+@scale.defjvp
+def _scale_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
+    # The product rule with the infinite values left out: a cotangent of 0 times inf would be NaN.
+    (factor, value), (d_factor, d_value) = primals, tangents
+    finite = jnp.where(jnp.isfinite(value), value, 0)
+    return scale(factor, value), d_factor * finite + factor * d_value
+
+
+def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
+    """Bound the image of a box under a constant matrix (exact in real arithmetic).
+
+    Args:
+        matrix: shape (m, n), finite, units [y]/[x].
+        x: box of shape (n,), units [x]; infinite sides allowed (``0 * inf = 0``).
+
+    Returns:
+        Box of shape (m,), units [y].
+
+    Raises:
+        ValueError: shapes do not agree.
+
+    >>> linear_image(np.array([[1.0, -2.0]]), Interval([0.0, 0.0], [1.0, 1.0]))
+    Interval([-2.], [1.])
+
+    Source: paper, Prop. 2 and Lemma 1.
+    """
+    if np.ndim(matrix) != 2 or len(x.shape) != 1 or matrix.shape[1] != x.shape[0]:
+        raise ValueError(
+            f"linear_image: a matrix (m, n) and a box (n,) are needed, got {np.shape(matrix)} and {x.shape}"
+        )
+    return nan_to_unbounded(image(matrix, x.astype(jnp.result_type(matrix, x.dtype))))
+
+
+def image(matrix: Any, x: Interval) -> Interval:
+    """`linear_image` without its checks, for a stack of matrices (..., m, n) and boxes (n,) or (..., n).
+
+    Rounded outward, also for the exact product with a matrix that was rounded to `matrix` entry by entry. NaN where it
+    overflows, see `nan_to_unbounded`.
+    """
+    low, high = products(matrix, x)
+    # A sum of products, not a dot: the batched dot of a tiny matrix is slow, and 0 * inf must not reach it.
+    return Interval.unchecked(rounding.sum_down(low), rounding.sum_up(high))
+
+
+def products(matrix: Any, x: Interval) -> tuple[Any, Any]:
+    """Smallest and largest of every product in ``matrix @ x``, (..., m, n), to nearest; for `rounding.sum_down`."""
+    at_lower, at_upper = scale(matrix, x.lower[..., None, :]), scale(matrix, x.upper[..., None, :])
+    # Sides are chosen by sign, not by min and max: those tie on boxes of width 0 and would halve the derivative of the
+    # width.
+    up = matrix >= 0
+    return jnp.where(up, at_lower, at_upper), jnp.where(up, at_upper, at_lower)
+
+
+def spread(matrix: Any, reach: Any) -> Any:
+    """Upper bound of ``matrix @ reach`` for a nonnegative matrix (..., m, n) and reach (n,) or (..., n)."""
+    return rounding.sum_up(scale(matrix, reach[..., None, :]))
+
+
+def slip(matrix: Any, reach: Any) -> Any:
+    """`spread` for matrices of the size of rounding, with less work and a thousandth more; see `rounding.generous`."""
+    return rounding.generous(add_up(scale(matrix, reach[..., None, :])))
+
+
+def add(*boxes: Interval) -> Interval:
+    """Minkowski sum of boxes; NaN where it overflows, see `nan_to_unbounded`."""
+    return Interval.unchecked(_add_down([box.lower for box in boxes]), -_add_down([-box.upper for box in boxes]))
+
+
+def _add_down(values: list[Any]) -> Any:
+    total = sum(values[1:], values[0])
+    if len(values) == 1 or not rounding.outward():
+        return total
+    if len(values) == 2:  # one operation: its error goes with the result
+        return rounding.down(total)
+    size = sum((abs(value) for value in values[1:]), abs(values[0]))
+    return rounding.lowered(total, size, len(values))
+
+
+def held(box: Interval) -> Interval:
+    """The box itself, whose bounds are computed once however often they are used; see `once`."""
+    return Interval.unchecked(once(box.lower), once(box.upper))
+
+
+def nan_to_unbounded(box: Interval) -> Interval:
+    """No bound where a side is NaN because it overflowed."""
+    if not rounding.outward():
+        return box
+    return Interval.unchecked(rounding.unbounded(box.lower, -jnp.inf), rounding.unbounded(box.upper, jnp.inf))
+
+
+def widen(box: Interval, radius: Any) -> Interval:
+    """The box, `radius` larger on either side; nothing where the radius is 0 by construction (None)."""
+    return box if radius is None else add(box, Interval.unchecked(-radius, radius))
+
+
+def reach(box: Interval) -> Any:
+    """Largest magnitude in the box, elementwise."""
+    return jnp.maximum(abs(box.lower), abs(box.upper))
+
+
+def entire_like(box: Any) -> Interval:
+    """All of R^n, in the shape and type of a box or an array."""
+    like = box.lower if isinstance(box, Interval) else box
+    return Interval.unchecked(jnp.full_like(like, -jnp.inf), jnp.full_like(like, jnp.inf))
+
+
+def choose(mask: Any, a: Interval, b: Interval) -> Interval:
+    """Elementwise `a` where the mask holds, else `b`."""
+    return Interval.unchecked(jnp.where(mask, a.lower, b.lower), jnp.where(mask, a.upper, b.upper))
+
+
+def hull(a: Interval, b: Interval) -> Interval:
+    """The smallest box that contains both boxes, elementwise."""
+    return Interval.unchecked(smaller(a.lower, b.lower), larger(a.upper, b.upper))
+
+
+def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
+    """Elementwise intersection and its signed slack.
+
+    Args:
+        a: a box.
+        b: a box of the same shape.
+
+    Returns:
+        The intersection, and the slack ``min(a.upper - b.lower, b.upper - a.lower)``: how far one box could be moved
+        before they miss each other. A negative slack is the size of the gap; there the first box is returned
+        unchanged, so the result is never crossed: the caller must look at the slack.
+    """
+    slack = smaller(a.upper - b.lower, b.upper - a.lower)
+    empty = slack < 0
+    lower, upper = larger(a.lower, b.lower), smaller(a.upper, b.upper)
+    return Interval.unchecked(jnp.where(empty, a.lower, lower), jnp.where(empty, a.upper, upper)), slack

@@ -1,0 +1,146 @@
+"""What a design promises: how wide the boxes can get, and where that promise holds. NumPy only, no solver."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.system import Noise
+
+
+class Certificate(eqx.Module):
+    """The width promise of a design, and everything needed to check it.
+
+    As long as two successive boxes of the state lie in `region` (anywhere, where f and g are affine) and no measurement
+    is missing, the widths obey ``next_width``, and so settle at or below `steady_width`.
+
+    Attributes:
+        certified: the width recursion contracts (`rate` < 1).
+        rate: spectral radius of ``A + |N_z| R`` (prediction form: ``|G||J1|`` in the place of ``|N_z| R``).
+        implicit_rate: spectral radius of ``|N_z| R`` on the region; below 1 the box of x[k] is finite.
+        steady_width: (n,) width that the state boxes settle at or below, design noise; ``inf`` if not certified.
+        input_width: (p,) the same for the input boxes.
+        region: box (n,) the enclosures of the derivatives hold on.
+        region_matters: False where f and g are affine and the region is all of R^n: there is nothing to leave.
+        slack: (n,) region width minus `steady_width`.
+        self_consistent: all slacks are nonnegative; otherwise the boxes cannot be promised to stay in the region, and
+            the certificate is empty.
+        equality_residual: largest entry of ``G - N_y H - N_z C G`` in the columns of free inputs.
+        recoverable: after one lost row of measurements the boxes become finite again (None: not examined).
+        notes: what a reader should know besides.
+        framer: the boxes are certain; False only for a prediction form that is none and was asked for all the same.
+
+    Source: design 4.2 and 4.4.
+    """
+
+    region: Interval
+    region_matters: bool = eqx.field(static=True)
+    growth: Any  # A, (n, n)
+    implicit: Any  # |N_z| R, (n, n)
+    noise_w: Any  # |P|, (n, n)
+    noise_v: Any  # |N_y| + |N_z T2|, (n, l)
+    noise_fixed: Any  # width that state bounds and known input bounds contribute, (n,)
+    input_state_now: Any  # |J1|, (p, n): weight of width[k]
+    input_state_before: Any  # (p, n): weight of width[k-1]
+    input_noise_v: Any  # |J2|, (p, l)
+    steady_width: Any
+    input_width: Any
+    equality_residual: Any
+    promised: bool = eqx.field(static=True)  # `certified`, known while tracing
+    recoverable: bool | None = eqx.field(static=True)
+    notes: tuple[str, ...] = eqx.field(static=True)
+    framer: bool = eqx.field(static=True, default=True)
+
+    @property
+    def rate(self) -> float:
+        """Spectral radius of ``A + |N_z| R``: the factor by which widths approach their steady value per step."""
+        return spectral_radius(np.asarray(self.growth) + np.asarray(self.implicit))
+
+    @property
+    def implicit_rate(self) -> float:
+        """Spectral radius of ``|N_z| R`` on the region."""
+        return spectral_radius(np.asarray(self.implicit))
+
+    @property
+    def certified(self) -> bool:
+        """The width recursion contracts."""
+        return self.promised
+
+    @property
+    def slack(self) -> np.ndarray:
+        """Region width minus steady width, (n,)."""
+        if not self.certified:
+            return np.full(np.shape(self.steady_width), -np.inf)
+        return np.asarray(self.region.width) - np.asarray(self.steady_width)
+
+    @property
+    def self_consistent(self) -> bool:
+        """The certificate is not empty: boxes of the steady width fit into the region."""
+        return self.certified and (not self.region_matters or bool((self.slack >= 0).all()))
+
+    def noise_width(self, noise: Noise) -> Any:
+        """What one step adds to the width, b of design 4.2, (n,) or (T, n)."""
+        return noise.w.width @ self.noise_w.T + noise.v.width @ self.noise_v.T + self.noise_fixed
+
+    def next_width(self, width: Any, noise: Noise) -> Any:
+        """The recursion ``(I - |N_z| R)^{-1} (A width + b)``, (n,) or a stack (..., n)."""
+        inverse = np.linalg.inv(np.eye(len(self.growth)) - np.asarray(self.implicit))
+        return (width @ self.growth.T + self.noise_width(noise)) @ inverse.T
+
+    def widths(self, noise: Noise) -> Any:
+        """Steady width (n,) or (..., n) for other noise bounds; all ``inf`` if the recursion does not contract."""
+        added = self.noise_width(noise)
+        if not self.certified:
+            return np.full(np.shape(added), np.inf)
+        return added @ np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit).T
+
+    def input_widths(self, noise: Noise) -> Any:
+        """Steady width (p,) or (..., p) of the input boxes for other noise bounds; ``inf`` as in `widths`."""
+        state = self.widths(noise)
+        if not self.certified:
+            return np.full((*np.shape(state)[:-1], len(self.input_width)), np.inf)
+        return self.input_width_after(state, state, noise)
+
+    def input_width_after(self, now: Any, before: Any, noise: Noise) -> Any:
+        """Width of the box of d[k-1] from the state widths at k and k-1, (p,) or a stack (..., p)."""
+        known = noise.w.width @ self.input_state_now.T + noise.v.width @ self.input_noise_v.T
+        return now @ self.input_state_now.T + before @ self.input_state_before.T + known
+
+    def __str__(self) -> str:
+        lines = [self._headline()]
+        lines.append(f"  rate {self.rate:.6g} per step · implicit part {self.implicit_rate:.3g} · equality residual "
+                     f"{self.equality_residual:.1e}")  # fmt: skip
+        lines.append(f"  {'':<10}{'steady width':>14}{'region width':>14}{'slack':>14}")
+        region_width = np.asarray(self.region.width)
+        for i, width in enumerate(np.asarray(self.steady_width)):
+            lines.append(f"  state {i + 1:<4}{width:>14.6g}{region_width[i]:>14.6g}{self.slack[i]:>14.6g}")
+        for j, width in enumerate(np.asarray(self.input_width)):
+            lines.append(f"  input {j + 1:<4}{width:>14.6g}{'-':>14}{'-':>14}")
+        if self.recoverable is not None:
+            lines.append(f"  a lost row of measurements is {'' if self.recoverable else 'NOT '}recovered from")
+        lines.extend(f"  note: {note}" for note in self.notes)
+        return "\n".join(lines)
+
+    def _headline(self) -> str:
+        if not self.framer:
+            return "Certificate: NONE. This recursion is NO framer: its boxes may cross and miss the truth."
+        if not self.certified:
+            return "Certificate: NONE. The boxes are certain, but no bound on their width is promised."
+        if not self.self_consistent:
+            return (
+                "Certificate: EMPTY. The steady width does not fit into the region (negative slack): the boxes are "
+                "certain, but cannot be promised to stay where the width bound holds."
+            )
+        if not self.region_matters:
+            return "Certificate: the widths settle at or below the steady width, from any initial box."
+        return "Certificate: while the boxes lie in the region, the widths settle at or below the steady width."
+
+
+def spectral_radius(matrix: np.ndarray) -> float:
+    """Largest modulus of an eigenvalue; ``inf`` where an entry is not finite."""
+    if not np.isfinite(matrix).all():
+        return float("inf")
+    return float(np.abs(np.linalg.eigvals(matrix)).max(initial=0.0))

@@ -1,0 +1,103 @@
+"""Simulated records whose noise lies inside the stated bounds after rounding, too."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.system import Noise, System
+
+
+class Simulation(NamedTuple):
+    """A simulated record: x (T+1, n), y (T, l), and the noise w (T, n), v (T, l) that the record really holds."""
+
+    x: Float[Array, "steps+1 n"]
+    y: Float[Array, "steps l"]
+    w: Float[Array, "steps n"]
+    v: Float[Array, "steps l"]
+
+
+def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = None) -> Simulation:
+    """Simulate the plant with noise drawn uniformly from its bounds.
+
+    Args:
+        system: the plant.
+        key: a key of `jax.random`.
+        x0: first state, shape (n,).
+        d: unknown input, shape (T, p).
+        noise: bounds of w and v.
+        u: known input, shape (T, m); needed where m > 0.
+
+    Returns:
+        `Simulation`. w and v are computed back from the recorded x and y, so that rounding of the sums cannot carry
+        the record out of the stated bounds by more than the rounding of that difference.
+
+    Raises:
+        ValueError: shapes do not agree.
+
+    Source: paper, (eq:system); design 7.
+    """
+    x0, d = jnp.asarray(x0, float), jnp.asarray(d, float)
+    if d.ndim != 2 or d.shape[1] != system.p:
+        raise ValueError(f"simulate: `d` must have shape (T, {system.p}), got {d.shape}")
+    if x0.shape != (system.n,):
+        raise ValueError(f"simulate: `x0` must have shape ({system.n},), got {x0.shape}")
+    if u is None:
+        if system.m > 0:
+            raise ValueError(f"simulate: the system has {system.m} known inputs; give `u` of shape (T, {system.m})")
+        u = jnp.zeros((d.shape[0], 0))
+    u = jnp.asarray(u, float)
+    if u.shape != (d.shape[0], system.m):
+        raise ValueError(f"simulate: `u` must have shape ({d.shape[0]}, {system.m}), got {u.shape}")
+    return _simulate(system, key, x0, d, noise.astype(x0.dtype), u)
+
+
+@jax.jit
+def _simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any) -> Simulation:
+    steps = d.shape[0]
+    key_w, key_v = jax.random.split(key)
+    bounds_w = _per_step(noise.w, steps, system.n)
+    bounds_v = _per_step(noise.v, steps, system.l)
+
+    def draw(key: Any, box: Interval) -> Any:
+        share = jax.random.uniform(key, box.shape, box.lower.dtype)
+        return box.lower + share * (box.upper - box.lower)
+
+    def step(x: Any, inputs: Any) -> tuple[Any, Any]:
+        d_k, u_k, w_k, v_k, box_w, box_v = inputs
+        y, v = measured(system, x, d_k, u_k, v_k, box_v)
+        x_next, w = moved(system, x, d_k, u_k, w_k, box_w)
+        return x_next, (x, y, w, v)
+
+    drawn = (draw(key_w, bounds_w), draw(key_v, bounds_v))
+    last, (x, y, w, v) = jax.lax.scan(step, x0, (d, u, *drawn, bounds_w, bounds_v))
+    return Simulation(jnp.concatenate([x, last[None]]), y, w, v)
+
+
+def measured(system: System, x: Any, d: Any, u: Any, v: Any, bounds: Interval) -> tuple[Any, Any]:
+    """The measurement y[k], and the noise v[k] that it holds after rounding."""
+    return _add(system.measurement(x, u) + system.D @ u + system.H @ d, v, bounds)
+
+
+def moved(system: System, x: Any, d: Any, u: Any, w: Any, bounds: Interval) -> tuple[Any, Any]:
+    """The next state x[k+1], and the noise w[k] that it holds after rounding."""
+    return _add(system.dynamics(x, u) + system.B @ u + system.G @ d, w, bounds)
+
+
+def _add(base: Any, noise: Any, box: Interval) -> tuple[Any, Any]:
+    # The sum rounds; the noise the record holds is the difference. Pull it inside by a few ulps where it left.
+    total = base + noise
+    margin = 4 * jnp.finfo(total.dtype).eps * jnp.abs(total)
+    low, high = jnp.minimum(box.lower + margin, box.center), jnp.maximum(box.upper - margin, box.center)
+    inner = jnp.clip(noise, low, high)
+    total = jnp.where(box.contains(total - base), total, base + inner)
+    return total, total - base
+
+
+def _per_step(box: Interval, steps: int, size: int) -> Interval:
+    shape = (steps, size)
+    return Interval.unchecked(jnp.broadcast_to(box.lower, shape), jnp.broadcast_to(box.upper, shape))

@@ -1,0 +1,245 @@
+"""The plant: a nonlinear discrete-time system with bounded noise and an unknown input without any bound.
+
+x[k+1] = f(x[k], u[k]) + B u[k] + G d[k] + w[k]
+y[k]   = g(x[k], u[k]) + D u[k] + H d[k] + v[k]
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.interval.box import Interval, is_concrete
+
+
+class System(eqx.Module):
+    """A plant with known maps and an unknown input; a pytree whose structure holds `f` and `g`.
+
+    Args:
+        f: state map, a JAX function of ``x`` (n,) or of ``(x, u)``; returns (n,).
+        g: output map, a JAX function of ``x`` or of ``(x, u)``; returns (l,).
+        G: how the unknown input enters the state, shape (n, p); p = 0 is a plain observer.
+        H: how the unknown input enters the output (feedthrough), shape (l, p), any rank.
+        B: how the known input enters the state, shape (n, m); zero if not given.
+        D: how the known input enters the output, shape (l, m); zero if not given.
+        state_bounds: box (n,) that every state is known to stay in (physics); all of R^n if not given.
+        input_bounds: box (p,) that the unknown input is known to stay in; nothing is assumed if not given.
+        m: number of known inputs, needed only where f or g takes ``u`` and both B and D are left out.
+
+    Raises:
+        ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
+            the wrong shape, or a bound does not fit.
+
+    Source: paper, (eq:system); design 2.
+    """
+
+    f: Callable[..., Any] = eqx.field(static=True)
+    g: Callable[..., Any] = eqx.field(static=True)
+    f_takes_u: bool = eqx.field(static=True)
+    g_takes_u: bool = eqx.field(static=True)
+    G: Any
+    H: Any
+    B: Any
+    D: Any
+    state_bounds: Interval
+    input_bounds: Interval
+
+    def __init__(
+        self,
+        f: Callable[..., Any],
+        g: Callable[..., Any],
+        G: Any,
+        H: Any,
+        B: Any = None,
+        D: Any = None,
+        state_bounds: Interval | None = None,
+        input_bounds: Interval | None = None,
+        m: int | None = None,
+    ):
+        self.f, self.g = f, g
+        self.f_takes_u, self.g_takes_u = _takes_u(f, "f"), _takes_u(g, "g")
+        self.G, self.H = _matrix("G", G), _matrix("H", H)
+        if self.G.shape[1] != self.H.shape[1]:
+            raise ValueError(
+                f"System: G has shape {self.G.shape} and H has shape {self.H.shape}; both need one column per "
+                "unknown input (give zero columns where an input does not act)"
+            )
+        m = _known_inputs(B, D, m, self.f_takes_u or self.g_takes_u)
+        self.B = np.zeros((self.n, m)) if B is None else _matrix("B", B, (self.n, m))
+        self.D = np.zeros((self.l, m)) if D is None else _matrix("D", D, (self.l, m))
+        _check_rank(self.G, self.H)
+        self.state_bounds = _bounds("state_bounds", state_bounds, self.n)
+        self.input_bounds = _bounds("input_bounds", input_bounds, self.p)
+        self._check_map("f", self.dynamics, self.n)
+        self._check_map("g", self.measurement, self.l)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.G.shape[0]
+
+    @property
+    def p(self) -> int:
+        """Number of unknown inputs."""
+        return self.G.shape[1]
+
+    @property
+    def l(self) -> int:  # noqa: E743
+        """Number of outputs."""
+        return self.H.shape[0]
+
+    @property
+    def m(self) -> int:
+        """Number of known inputs."""
+        return self.B.shape[1]
+
+    @property
+    def takes_u(self) -> bool:
+        """f or g takes the known input, so enclosures of their derivatives depend on it."""
+        return self.f_takes_u or self.g_takes_u
+
+    def dynamics(self, x: Any, u: Any) -> Any:
+        """``f(x)`` or ``f(x, u)``, whichever the user gave."""
+        return self.f(x, u) if self.f_takes_u else self.f(x)
+
+    def measurement(self, x: Any, u: Any) -> Any:
+        """``g(x)`` or ``g(x, u)``, whichever the user gave."""
+        return self.g(x, u) if self.g_takes_u else self.g(x)
+
+    def maps(self, x: Any, u: Any) -> Any:
+        """f and g together, (n + l,)."""
+        return jnp.concatenate([self.dynamics(x, u), self.measurement(x, u)])
+
+    def _check_map(self, name: str, function: Callable[..., Any], size: int) -> None:
+        dtype = jnp.result_type(float)
+        x, u = jax.ShapeDtypeStruct((self.n,), dtype), jax.ShapeDtypeStruct((self.m,), dtype)
+        try:
+            out = jax.eval_shape(function, x, u)
+        except Exception as error:
+            raise ValueError(
+                f"System: calling {name} with x of shape ({self.n},) and u of shape ({self.m},) failed: {error}"
+            ) from error
+        if getattr(out, "shape", None) != (size,):
+            raise ValueError(
+                f"System: {name} must return an array of shape ({size},) to fit the rows of "
+                f"{'G' if name == 'f' else 'H'}, it returns {getattr(out, 'shape', type(out).__name__)}"
+            )
+
+
+class Noise(eqx.Module):
+    """Bounds of the process noise `w` and of the measurement noise `v`; a pytree.
+
+    Args:
+        w: box (n,), units of the state; or (T, n) for bounds that change with time.
+        v: box (l,), units of the output; or (T, l).
+
+    Raises:
+        ValueError: a bound is infinite. (NaN and crossed bounds are refused by `Interval`.)
+
+    Source: paper, Section II; design 2.
+    """
+
+    w: Interval
+    v: Interval
+
+    def __init__(self, w: Interval, v: Interval):
+        for name, box in (("w", w), ("v", v)):
+            if not isinstance(box, Interval):
+                raise ValueError(f"Noise: `{name}` must be a gsisio_jax.Interval, got {type(box).__name__}")
+            values = (box.lower, box.upper)
+            if all(is_concrete(x) for x in values) and not all(np.isfinite(np.asarray(x)).all() for x in values):
+                raise ValueError(
+                    f"Noise: the bounds of `{name}` must be finite, got {box}; noise without a bound belongs into the "
+                    "unknown input d (a column of G or H)"
+                )
+        self.w, self.v = w, v
+
+    @classmethod
+    def unchecked(cls, w: Any, v: Any) -> Noise:
+        """Build without looking at the numbers."""
+        self = object.__new__(cls)
+        object.__setattr__(self, "w", w)
+        object.__setattr__(self, "v", v)
+        return self
+
+    def astype(self, dtype: Any) -> Noise:
+        """The same bounds in another floating type, rounded outward."""
+        return Noise.unchecked(self.w.astype(dtype), self.v.astype(dtype))
+
+
+def _takes_u(function: Callable[..., Any], name: str) -> bool:
+    """Does the user's map take (x, u)? Counted from its required positional parameters."""
+    if not callable(function):
+        raise ValueError(f"System: `{name}` must be a function of x or of (x, u), got {type(function).__name__}")
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # builtins without a signature
+        return False
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    required = [p for p in parameters if p.kind in positional and p.default is inspect.Parameter.empty]
+    if len(required) not in (1, 2):
+        raise ValueError(
+            f"System: `{name}` must take x or (x, u); it takes {len(required)} required arguments "
+            f"({', '.join(p.name for p in required)}); bind parameters with functools.partial"
+        )
+    return len(required) == 2
+
+
+def _matrix(name: str, value: Any, shape: tuple[int, int] | None = None) -> np.ndarray:
+    try:
+        matrix = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"System: {name} must be a matrix of real numbers, got {value!r}") from error
+    if matrix.ndim != 2:
+        raise ValueError(f"System: {name} must be a matrix (2 dimensions), got shape {matrix.shape}")
+    if shape is not None and matrix.shape != shape:
+        raise ValueError(f"System: {name} must have shape {shape}, got {matrix.shape}")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"System: {name} has an entry that is not finite: {matrix.tolist()}")
+    return matrix
+
+
+def _known_inputs(B: Any, D: Any, m: int | None, takes_u: bool) -> int:
+    sizes = {np.shape(matrix)[1] for matrix in (B, D) if matrix is not None and np.ndim(matrix) == 2}
+    if m is not None:
+        sizes.add(int(m))
+    if len(sizes) > 1:
+        raise ValueError(f"System: B, D and m disagree on the number of known inputs: {sorted(sizes)}")
+    if not sizes and takes_u:
+        raise ValueError(
+            "System: f or g takes u, but B and D are not given; say how many known inputs there are: m=..."
+        )
+    return sizes.pop() if sizes else 0
+
+
+def _check_rank(G: np.ndarray, H: np.ndarray) -> None:
+    p = G.shape[1]
+    if p == 0:
+        return
+    stacked = np.vstack([G, H])
+    _, singular, right = np.linalg.svd(stacked)
+    # Columns may have very different units: judge the rank of the normalised ones.
+    norms = np.linalg.norm(stacked, axis=0)
+    rank = 0 if (norms == 0).any() else np.linalg.matrix_rank(stacked / norms)
+    if stacked.shape[0] < p or rank < p:
+        raise ValueError(
+            f"System: [G; H] must have full column rank {p}; the input direction {np.round(right[-1], 6).tolist()} "
+            f"acts on neither state nor output (smallest singular value {singular[-1]:.3g}). Remove or merge "
+            "unknown inputs."
+        )
+
+
+def _bounds(name: str, box: Interval | None, size: int) -> Interval:
+    if box is None:
+        return Interval.entire(size)
+    if not isinstance(box, Interval):
+        raise ValueError(f"System: `{name}` must be a gsisio_jax.Interval of shape ({size},), got {type(box).__name__}")
+    if box.shape != (size,):
+        raise ValueError(f"System: `{name}` must have shape ({size},), got {box.shape}; use -inf and inf where unknown")
+    return box
