@@ -17,7 +17,7 @@ import numpy as np
 from gsisio_jax.design.basic_inverses import basic_left_inverses, circuits
 from gsisio_jax.design.gains import solve
 from gsisio_jax.design.problem import GainProblem, without_rounding
-from gsisio_jax.observer.contractors import LinearBounds
+from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.types import ExactInputs
 
 MOST_SUPPORTS = 500  # basic left inverses per group of inputs that share rows; each costs time in every step
@@ -38,18 +38,19 @@ def input_bounds(problem: GainProblem, width: np.ndarray) -> InputBounds:
         problem: the gain problem.
         width: typical width of the state boxes, (n,).
     """
-    return InputBounds(_joint(problem, width), *_exact(problem, width))
+    exact, note = _exact(problem, width)
+    return InputBounds(_joint(problem, width, exact.complete), exact, note)
 
 
-def _joint(problem: GainProblem, width: np.ndarray) -> LinearBounds:
+def _joint(problem: GainProblem, width: np.ndarray, complete: bool) -> LinearBounds:
     n, l, q, p = problem.n, problem.l, problem.q, problem.G.shape[1]
     s = problem.columns - l - q
     direct, lifted = [], []
     if p:
         direct = _distinct([_direct(problem, width, use_y) for use_y in (True, False)])
         lifted = _distinct([_lifted(problem, width, *use) for use in product((True, False), repeat=2)])
-        direct.append(_pseudo_inverse(problem))
-        direct = _distinct(direct)
+        if not complete:  # where all basic rows are there, the pseudo-inverse adds nothing to them
+            direct = _distinct([*direct, _pseudo_inverse(problem)])
     else:
         direct = [np.zeros((0, n + l))]
     rows = []

@@ -15,27 +15,7 @@ from jax.core import Tracer
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, nan_to_unbounded
 from gsisio_jax.interval.minmax import larger, smaller
-from gsisio_jax.interval.xla import add_up
-
-
-@jax.custom_jvp
-def times(a: Any, b: Any) -> Any:
-    """``a * b`` with ``0 * inf = 0``; its derivative treats a factor near infinity as 0, so gradients stay finite."""
-    product = a * b
-    return jnp.where(jnp.isnan(product), 0, product)
-
-
-@times.defjvp
-def _times_jvp(primals: Any, tangents: Any) -> Any:
-    (a, b), (da, db) = primals, tangents
-    largest = moderate(jnp.result_type(a, b))
-    return times(a, b), jnp.where(jnp.abs(a) < largest, a, 0) * db + jnp.where(jnp.abs(b) < largest, b, 0) * da
-
-
-def moderate(dtype: Any) -> float:
-    """Numbers above this one overflow as soon as a gradient weighs them."""
-    info = jnp.finfo(dtype)
-    return float(info.max) * float(info.eps) ** 2
+from gsisio_jax.interval.primitives import add_up, times
 
 
 def is_known(value: Any) -> bool:

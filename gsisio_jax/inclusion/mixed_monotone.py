@@ -25,11 +25,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.form_arithmetic import times
 from gsisio_jax.inclusion.pointwise import Rows, check_derivative, room
 from gsisio_jax.inclusion.transforms import AffineForm, affine
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.minmax import larger, largest, smaller, smallest
+from gsisio_jax.interval.primitives import times
 from gsisio_jax.interval.rounding import Rounding, as_nearest, rounded_by
 
 MAX_CORNER_DIMENSION = 10

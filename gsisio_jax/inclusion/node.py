@@ -43,7 +43,7 @@ from gsisio_jax.inclusion.form_arithmetic import (
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, held, reach
 from gsisio_jax.interval.minmax import larger, smaller
-from gsisio_jax.interval.xla import add_up, once
+from gsisio_jax.interval.primitives import add_up, fusion_barrier
 
 # The box is a point and only ranges are asked for: forms are kept for linear functions alone, whose value at the point
 # they give with a single widening.
@@ -51,7 +51,7 @@ POINT_MODE: ContextVar[bool] = ContextVar("gsisio_jax_point_mode", default=False
 _LOSS = 64.0  # in best_form: narrower by less than this many ulps is narrower by rounding
 
 
-class Domain(eqx.Module):
+class InputBox(eqx.Module):
     """The box of x, and the largest magnitude of every entry."""
 
     lower: Any
@@ -59,7 +59,7 @@ class Domain(eqx.Module):
     reach: Any
 
     @classmethod
-    def of(cls, box: Interval) -> Domain:
+    def of(cls, box: Interval) -> InputBox:
         return cls(box.lower, box.upper, abs(box.lower) if is_point(box) else reach(box))
 
 
@@ -71,7 +71,7 @@ class Form(eqx.Module):
 
     slope: Any
     offset: Interval
-    box: Domain
+    box: InputBox
     slack: Any = None
 
     def folded(self) -> Interval:
@@ -213,7 +213,7 @@ def meet(node: Node) -> Node:
     )
 
 
-def best_form(slope: Any, offset: Interval, natural: Interval, box: Domain, slack: Any = None, size: Any = 0) -> Form:
+def best_form(slope: Any, offset: Interval, natural: Interval, box: InputBox, slack: Any = None, size: Any = 0) -> Form:
     """The form with this slope, or slope 0 with the natural range where that one is narrower.
 
     A slope that overflowed needs no care here: its image is not a number, which never enters a range, and the
@@ -225,7 +225,7 @@ def best_form(slope: Any, offset: Interval, natural: Interval, box: Domain, slac
     loss = _LOSS * jnp.finfo(width.dtype).eps * jax.lax.stop_gradient(size)
     good = jnp.isfinite(width) & (width - loss <= natural.upper - natural.lower)
     slack = None if slack is None else jnp.where(good, slack, 0)
-    return Form(once(jnp.where(good, slope, 0)), held(choose(good, offset, natural)), box, slack)
+    return Form(fusion_barrier(jnp.where(good, slope, 0)), held(choose(good, offset, natural)), box, slack)
 
 
 def unsettled(given: Interval | None, form: Form | None, jac: Interval | None) -> Node:
@@ -275,7 +275,7 @@ def parts(values: Any) -> tuple[Any, Any]:
     return box, jac
 
 
-def slope_of(node: Node, box: Domain) -> Any:
+def slope_of(node: Node, box: InputBox) -> Any:
     if node.form is not None:
         return node.form.slope
     return np.zeros((box.lower.shape[0], *node.shape), node.dtype)

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.form_arithmetic import guard, times
+from gsisio_jax.inclusion.form_arithmetic import guard
 from gsisio_jax.inclusion.transforms import _typed, distance, jacobian, natural
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.minmax import larger, smaller
+from gsisio_jax.interval.primitives import times
 
 
 def room(a: Any, b: Any, behind: Any, ahead: Any) -> Any:

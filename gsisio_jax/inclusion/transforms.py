@@ -13,10 +13,10 @@ from jaxtyping import Array, Float
 
 from gsisio_jax.inclusion.form_arithmetic import guard, is_known, is_point, product, shift, slope_image, sum_slack
 from gsisio_jax.inclusion.interpreter import evaluate
-from gsisio_jax.inclusion.node import POINT_MODE, Domain, Form, Node, as_node, is_node, jac_of, slack_of, slope_of
+from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node, is_node, jac_of, slack_of, slope_of
 from gsisio_jax.interval.box import Interval, choose
+from gsisio_jax.interval.primitives import add_up
 from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
-from gsisio_jax.interval.xla import add_up
 
 
 class AffineForm(eqx.Module):
@@ -168,7 +168,7 @@ def _variable(box: Interval, derivative: bool = False) -> Node:
     eye = np.eye(box.lower.shape[0], dtype=box.lower.dtype)
     zero = np.zeros(box.shape, box.lower.dtype)
     jac = Interval.unchecked(eye, eye) if derivative else None
-    return Node(box, Form(eye, Interval.unchecked(zero, zero), Domain.of(box)), jac)
+    return Node(box, Form(eye, Interval.unchecked(zero, zero), InputBox.of(box)), jac)
 
 
 def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable[[Any], Any]) -> Any:
@@ -202,7 +202,9 @@ def _in_type(node: Node, dtype: Any) -> Node:
         slope = jnp.asarray(form.slope).astype(dtype)
         lost = abs(slope) * np.dtype(dtype).type(2 * jnp.finfo(dtype).eps)
         slack = sum_slack(lost, None if form.slack is None else (2 * form.slack).astype(dtype))
-        domain = Domain(*(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.reach)))
+        domain = InputBox(
+            *(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.reach))
+        )
         form = Form(slope, form.offset.astype(dtype), domain, slack)
     return Node(node.range.astype(dtype), form, None if node.jac is None else node.jac.astype(dtype))
 
@@ -217,7 +219,7 @@ def _finish_range(node: Node) -> Interval:
 
 
 def _finish_affine(node: Node, box: Interval) -> AffineForm:
-    slope, offset = slope_of(node, Domain.of(box)), guard(node.offset if node.form is None else node.form.folded())
+    slope, offset = slope_of(node, InputBox.of(box)), guard(node.offset if node.form is None else node.form.folded())
     # Slopes that overflowed say nothing: slope 0 does.
     bounds = guard(node.range)
     if is_known(slope):
@@ -236,7 +238,7 @@ def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
         box = _typed("affine", box, args)
 
         def finish(node: Node) -> tuple[AffineForm, Any]:
-            slope = slope_of(node, Domain.of(box))
+            slope = slope_of(node, InputBox.of(box))
             slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
             good, bounds = jnp.isfinite(add_up(abs(slope))), guard(node.range)
             slope, slack = (jnp.where(good[..., None], v, 0) for v in (slope, slack))

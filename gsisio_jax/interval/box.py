@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.minmax import larger, smaller
-from gsisio_jax.interval.xla import add_up, once
+from gsisio_jax.interval.primitives import add_up, fusion_barrier, scale
 
 
 def is_concrete(value: Any) -> bool:
@@ -223,21 +223,6 @@ def cast_up(value: Any, dtype: Any) -> Any:
     return _cast(value, dtype, np.inf)
 
 
-@jax.custom_jvp
-def scale(factor: Any, value: Any) -> Any:
-    """``factor * value`` with ``0 * inf = 0``, for finite factors; finite gradients even where `value` is infinite."""
-    factor, value = jnp.asarray(factor), jnp.asarray(value)
-    return jnp.where(factor == 0, 0, factor * value)
-
-
-@scale.defjvp
-def _scale_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
-    # The product rule with the infinite values left out: a cotangent of 0 times inf would be NaN.
-    (factor, value), (d_factor, d_value) = primals, tangents
-    finite = jnp.where(jnp.isfinite(value), value, 0)
-    return scale(factor, value), d_factor * finite + factor * d_value
-
-
 def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
     """Bound the image of a box under a constant matrix (exact in real arithmetic).
 
@@ -274,6 +259,28 @@ def image(matrix: Any, x: Interval) -> Interval:
     return Interval.unchecked(rounding.sum_down(low), rounding.sum_up(high))
 
 
+def widened(box: Interval, terms: int) -> Interval:
+    """The box, wider by what `plain_image` loses in a sum of so many terms, whatever the weights are.
+
+    A sum of n products of weights that were rounded once is off by ``(n + 4) eps sum |w_i| |x_i|`` at most, and every
+    side is moved by ``kappa |x_i|`` with ``kappa = (n + 8) eps``; what is flushed to zero is in ``2^60 tiny``
+    (`rounding.generous`).
+    """
+    if not rounding.outward():
+        return box
+    info = jnp.finfo(box.dtype)
+    kind = np.dtype(box.dtype).type
+    kappa, floor = kind((terms + 8) * float(info.eps)), kind(2.0**60 * float(info.tiny))
+    lower, upper = (jax.lax.stop_gradient(abs(side)) * kappa + floor for side in (box.lower, box.upper))
+    return Interval.unchecked(box.lower - lower, box.upper + upper)
+
+
+def plain_image(matrix: Any, x: Interval) -> Interval:
+    """`image` of a box that has been through `widened`: sums as they come. NaN where it overflows."""
+    low, high = products(matrix, x)
+    return Interval.unchecked(low.sum(-1), high.sum(-1))
+
+
 def products(matrix: Any, x: Interval) -> tuple[Any, Any]:
     """Smallest and largest of every product in ``matrix @ x``, (..., m, n), to nearest; for `rounding.sum_down`."""
     at_lower, at_upper = scale(matrix, x.lower[..., None, :]), scale(matrix, x.upper[..., None, :])
@@ -289,8 +296,10 @@ def spread(matrix: Any, reach: Any) -> Any:
 
 
 def slip(matrix: Any, reach: Any) -> Any:
-    """`spread` for matrices of the size of rounding, with less work and a thousandth more; see `rounding.generous`."""
-    return rounding.generous(add_up(scale(matrix, reach[..., None, :])))
+    """`spread` for matrices of the size of rounding, with less work and a thousandth more (`rounding.generous`); exactly
+    0 for rows of zeros."""
+    found = rounding.generous(add_up(scale(matrix, reach[..., None, :])))
+    return jnp.where((matrix != 0).any(-1), found, 0)
 
 
 def add(*boxes: Interval) -> Interval:
@@ -310,7 +319,7 @@ def _add_down(values: list[Any]) -> Any:
 
 def held(box: Interval) -> Interval:
     """The box itself, whose bounds are computed once however often they are used; see `once`."""
-    return Interval.unchecked(once(box.lower), once(box.upper))
+    return Interval.unchecked(fusion_barrier(box.lower), fusion_barrier(box.upper))
 
 
 def nan_to_unbounded(box: Interval) -> Interval:

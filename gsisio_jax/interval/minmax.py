@@ -14,89 +14,13 @@ nonnegative, so at a tie this is a subgradient. Values are those of JAX, bit by 
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-
-def smaller(a: Any, b: Any) -> Any:
-    """``jnp.minimum(a, b)``.
-
-    >>> jax.grad(lambda t: smaller(2 * t, t + 1))(1.0).item()
-    1.5
-    """
-    return _smaller(*_alike(a, b))
-
-
-def larger(a: Any, b: Any) -> Any:
-    """``jnp.maximum(a, b)``."""
-    return _larger(*_alike(a, b))
-
-
-def _alike(a: Any, b: Any) -> tuple[Any, Any]:
-    # In one type: an integer would have no derivative to weigh.
-    dtype = jnp.result_type(a, b)
-    return jnp.asarray(a, dtype), jnp.asarray(b, dtype)
-
-
-@jax.custom_jvp
-def _smaller(a: Any, b: Any) -> Any:
-    return jnp.minimum(a, b)
-
-
-@_smaller.defjvp
-def _smaller_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
-    (a, b), (da, db) = primals, tangents
-    return _smaller(a, b), _mix(_share(a, b), da, db)
-
-
-@jax.custom_jvp
-def _larger(a: Any, b: Any) -> Any:
-    return jnp.maximum(a, b)
-
-
-@_larger.defjvp
-def _larger_jvp(primals: tuple[Any, Any], tangents: tuple[Any, Any]) -> tuple[Any, Any]:
-    (a, b), (da, db) = primals, tangents
-    return _larger(a, b), _mix(_share(b, a), da, db)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
-def smallest(values: Any, axis: int) -> Any:
-    """``values.min(axis)``, for an axis that is not empty."""
-    return values.min(axis)
-
-
-@smallest.defjvp
-def _smallest_jvp(axis: int, primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
-    (values,), (slopes,) = primals, tangents
-    return smallest(values, axis), _first(jnp.moveaxis(values, axis, 0), jnp.moveaxis(slopes, axis, 0))
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
-def largest(values: Any, axis: int) -> Any:
-    """``values.max(axis)``, for an axis that is not empty."""
-    return values.max(axis)
-
-
-@largest.defjvp
-def _largest_jvp(axis: int, primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
-    (values,), (slopes,) = primals, tangents
-    return largest(values, axis), _first(-jnp.moveaxis(values, axis, 0), jnp.moveaxis(slopes, axis, 0))
-
-
-def _first(values: Any, slopes: Any) -> Any:
-    """The slope that belongs to the smallest value along the first axis, by a tournament: in pairs the weights add up
-    to 1 even where a number is computed twice and differs; means over all that equal the minimum would not."""
-    while (count := values.shape[0]) > 1:
-        half = count // 2
-        a, b = values[:half], values[half : 2 * half]
-        met = _mix(_share(a, b), slopes[:half], slopes[half : 2 * half])
-        values = jnp.concatenate([jnp.minimum(a, b), values[2 * half :]])
-        slopes = jnp.concatenate([met, slopes[2 * half :]])
-    return slopes[0]
+from gsisio_jax.interval.primitives import elementwise
 
 
 def _share(a: Any, b: Any) -> Any:
@@ -116,3 +40,67 @@ def _mix(share: Any, da: Any, db: Any) -> Any:
     # as many operations in the compiled gradient of a single tank, and half as much compile time again).
     one = share + (1 - share)
     return (share * da + (1 - share) * db) / one
+
+
+def _smaller_derivative(primals: Any, tangents: Any, out: Any) -> Any:
+    return _mix(_share(*primals), *tangents)
+
+
+def _larger_derivative(primals: Any, tangents: Any, out: Any) -> Any:
+    return _mix(_share(*primals[::-1]), *tangents)
+
+
+smaller = elementwise("smaller", jax.lax.min, _smaller_derivative)
+"""``jnp.minimum(a, b)``.
+
+>>> jax.grad(lambda t: smaller(2 * t, t + 1))(1.0).item()
+1.5
+"""
+
+larger = elementwise("larger", jax.lax.max, _larger_derivative)
+"""``jnp.maximum(a, b)``."""
+
+
+def _raised_body(lower: Any, other: Any) -> Any:
+    return jax.lax.select(jax.lax.gt(other, lower), other, lower)
+
+
+def _cut_body(upper: Any, other: Any) -> Any:
+    return jax.lax.select(jax.lax.lt(other, upper), other, upper)
+
+
+def _unless_nan(rule: Callable[..., Any]) -> Callable[..., Any]:
+    def derivative(primals: Any, tangents: Any, out: Any) -> Any:
+        (kept, other), (d_kept, d_other) = primals, tangents
+        missing = jnp.isnan(other)
+        return rule((kept, jnp.where(missing, kept, other)), (d_kept, jnp.where(missing, d_kept, d_other)), out)
+
+    return derivative
+
+
+raised = elementwise("raised", _raised_body, _unless_nan(_larger_derivative))
+"""The larger of a lower bound and another one, which is passed over where it is NaN (it overflowed)."""
+
+cut = elementwise("cut", _cut_body, _unless_nan(_smaller_derivative))
+"""The smaller of an upper bound and another one, which is passed over where it is NaN (it overflowed)."""
+
+
+def smallest(values: Any, axis: int) -> Any:
+    """``values.min(axis)``, for an axis that is not empty."""
+    return _fold(smaller, values, axis)
+
+
+def largest(values: Any, axis: int) -> Any:
+    """``values.max(axis)``, for an axis that is not empty."""
+    return _fold(larger, values, axis)
+
+
+def _fold(rule: Callable[..., Any], values: Any, axis: int) -> Any:
+    """By a tournament: in pairs the weights of derivatives add up to 1 even where a number is computed twice and
+    differs; means over all that equal the minimum would not."""
+    values = jnp.moveaxis(values, axis, 0)
+    while (count := values.shape[0]) > 1:
+        half = count // 2
+        met = rule(values[:half], values[half : 2 * half])
+        values = met if count % 2 == 0 else jnp.concatenate([met, values[2 * half :]])
+    return values[0]

@@ -40,7 +40,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.interval.xla import add_up, once
+from gsisio_jax.interval.primitives import add_up, fusion_barrier
 
 Rounding = Literal["outward", "nearest"]
 _MODE: ContextVar[str] = ContextVar("gsisio_jax_rounding", default="outward")
@@ -161,25 +161,25 @@ def generous(radius: Any) -> Any:
     thousandth is nothing.
     """
     kind = np.dtype(radius.dtype).type
-    return once(radius * kind(1 + 2.0**-10) + kind(2.0**60 * float(jnp.finfo(radius.dtype).tiny)))
+    return fusion_barrier(radius * kind(1 + 2.0**-10) + kind(2.0**60 * float(jnp.finfo(radius.dtype).tiny)))
 
 
 def sum_down(terms: Any, axis: int = -1) -> Any:
     """Lower bound of the sum of terms that are products; ``-inf`` where a term is, NaN where the sum overflows."""
     total = add_up(terms, axis)
     if not outward() or not terms.shape[axis]:
-        return once(total)
+        return fusion_barrier(total)
     n = terms.shape[axis] + 4.0
-    return once(total - error(add_up(abs(terms), axis), n, n))
+    return fusion_barrier(total - error(add_up(abs(terms), axis), n, n))
 
 
 def sum_up(terms: Any, axis: int = -1) -> Any:
     """Upper bound of the sum of terms that are products; see `sum_down`."""
     total = add_up(terms, axis)
     if not outward() or not terms.shape[axis]:
-        return once(total)
+        return fusion_barrier(total)
     n = terms.shape[axis] + 4.0
-    return once(total + error(add_up(abs(terms), axis), n, n))
+    return fusion_barrier(total + error(add_up(abs(terms), axis), n, n))
 
 
 def unbounded(x: Any, side: float) -> Any:

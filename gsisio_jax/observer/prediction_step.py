@@ -13,14 +13,16 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.intersection import bound
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, intersect, nan_to_unbounded, scale
+from gsisio_jax.interval.box import Interval, add, choose, image, intersect, nan_to_unbounded, reach, scale, slip, widen
+from gsisio_jax.interval.primitives import multiplied
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.certificate import Certificate
-from gsisio_jax.observer.contractors import Evidence, magnitude
-from gsisio_jax.observer.measurement import current_input, in_box, inside, output_box
+from gsisio_jax.observer.domain import Domain, largest_magnitude
+from gsisio_jax.observer.measurement import in_box, inside, output_box
 from gsisio_jax.observer.status import Source, Status, bit_mask
 from gsisio_jax.observer.types import Carry, StepOutput, cast
 from gsisio_jax.plant.system import Noise, System
@@ -75,13 +77,14 @@ class PredictionObserver(eqx.Module):
         return cast(self, dtype)
 
 
-@rounding.by_observer
-def begin(
-    observer: PredictionObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool = False
-) -> tuple[Carry, StepOutput]:
-    """Step 0: no measurement comes before it, so the box of x[0] is the initial one (met with the state bounds)."""
-    system = observer.system
-    return _finish(observer, initial, system.input_bounds, None, y, u, noise)
+def blank(observer: PredictionObserver, initial: Interval) -> Carry:
+    """The past of a first step: nothing is known but the initial box."""
+    n, l, m = observer.system.n, observer.system.l, observer.system.m
+    zero = jnp.zeros(n + l, initial.dtype)
+    nothing = Interval.unchecked(zero, zero)
+    h = AffineForm(jnp.zeros((n + l, n), initial.dtype), nothing, nothing)
+    noise = Noise.unchecked(nothing[:n], nothing[n:])
+    return Carry(initial, h, zero[n:], zero[:1].repeat(m, 0), noise, jnp.asarray(True), jnp.asarray(True))
 
 
 @rounding.by_observer
@@ -105,7 +108,9 @@ def advance(
     upper = jnp.concatenate([x.upper - h.lower[:n] - known_f - w.lower, output - h.lower[n:] - v.lower])
     lower = jnp.concatenate([x.lower - h.upper[:n] - known_f - w.upper, output - h.upper[n:] - v.upper])
     d = _rows(observer.input_gain, jnp.concatenate([upper, lower]), p)
-    return _finish(observer, x, d, carry, y, u, noise)
+    # No measurement comes before the first step, so the box of x[0] is the initial one.
+    x = choose(carry.starts, carry.state, x)
+    return _finish(observer, x, choose(carry.starts, system.input_bounds, d), carry, y, u, noise)
 
 
 def _rows(matrix: Any, value: Any, size: int) -> Interval:
@@ -121,31 +126,44 @@ def _rows(matrix: Any, value: Any, size: int) -> Interval:
 
 
 def _finish(
-    observer: PredictionObserver, x: Interval, d: Interval, carry: Carry | None, y: Any, u: Any, noise: Noise
+    observer: PredictionObserver, x: Interval, d: Interval, carry: Carry, y: Any, u: Any, noise: Noise
 ) -> tuple[Carry, StepOutput]:
     """Meet with what is known anyway (where the boxes are framers), and report."""
     system, certificate = observer.system, observer.certificate
-    evidence = Evidence(x, magnitude(y, x.lower, x.upper))
+    domain = Domain.of(x, largest_magnitude(y, x.lower, x.upper))
     if observer.framer:
         # In exact arithmetic these are never crossed; sorting undoes rounding.
-        evidence = Evidence(system.state_bounds, evidence.scale).meet(_sorted(x)[None], Source.STATE)
+        bounds = system.state_bounds.astype(x.dtype)
+        domain = domain.with_box(bounds).intersect(_sorted(x)[None], Source.STATE)
         d, slack = intersect(system.input_bounds, _sorted(d))
-        evidence = evidence.weigh(slack, Source.INPUT)
-        d = choose(evidence.conflict, system.input_bounds, d)
-    x = choose(evidence.conflict, system.state_bounds, evidence.box)
+        domain = domain.record_margin(slack, Source.INPUT)
+        d = choose(domain.conflict, system.input_bounds, d)
+    x = choose(domain.conflict, system.state_bounds, domain.box)
     h = bound(system.maps, observer.bounds, observer.abstraction, observer.derivative)(_sorted(x), u)
     applies = in_box(u, observer.u_region)
     if certificate.region_matters:
-        applies = applies & inside(x if carry is None else carry.state, certificate.region)
+        applies = applies & inside(choose(carry.starts, x, carry.state), certificate.region)
     bits = (
-        (evidence.conflict, Status.CONFLICT),
+        (domain.conflict, Status.CONFLICT),
         (~jnp.isfinite(y).all(), Status.MISSING),
         (~(jnp.isfinite(x.lower) & jnp.isfinite(x.upper)).all(), Status.UNBOUNDED),
         (~applies, Status.OUTSIDE_REGION),
         ((x.lower > x.upper).any() | (d.lower > d.upper).any(), Status.CROSSED),
     )
-    d1 = current_input(observer.current, h, _sorted(x), output_box(system, y, u, noise.v))
-    return Carry(x, h, y, u, noise), StepOutput(x, d, d1, bit_mask(bits), *evidence.tightest())
+    d1 = _current_input(observer.current, h, _sorted(x), output_box(system, y, u, noise.v))
+    after = Carry(x, h, y, u, noise, jnp.asarray(False), jnp.asarray(True))
+    return after, StepOutput(x, d, d1, bit_mask(bits), *domain.tightest())
+
+
+def _current_input(current: Any, h: AffineForm, state: Interval, output: Interval) -> Interval:
+    """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
+    n, weights = state.shape[0], -current
+    slope = multiplied(weights, h.slope[n:])
+    joint = add(image(slope, state), image(weights, h.offset[n:]))
+    if rounding.outward():
+        lost = slip(abs(weights), slip(abs(h.slope[n:]), reach(state)))  # of the slopes before they cancelled
+        joint = widen(joint, rounding.error(lost, h.slope.shape[0] - n + 6.0))
+    return nan_to_unbounded(add(intersect(joint, image(weights, h.range[n:]))[0], image(current, output)))
 
 
 def _sorted(box: Interval) -> Interval:

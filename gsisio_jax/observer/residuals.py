@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax.observer.bank import CancellationResidual, LinearBounds
 from gsisio_jax.observer.certificate import spectral_radius
-from gsisio_jax.observer.contractors import CancellationResidual, LinearBounds
 
 _INFLATIONS = (2e-15, 2e-14, 2e-13, 2e-12, 2e-10)
 _exact = np.vectorize(Fraction, otypes=[object])

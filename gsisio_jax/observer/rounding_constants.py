@@ -20,7 +20,7 @@ import numpy as np
 from gsisio_jax import inclusion
 from gsisio_jax.inclusion.transforms import AffineForm, affine_with_slack
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer.contractors import LinearBounds
+from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.residuals import (
     cancellation_residual,
     exact,

@@ -1,7 +1,7 @@
-"""The recursion of the current form, one step at a time (design 4.3).
+"""One step of the current form, from the box of x[k-1] to that of x[k] (design 4.3).
 
-`begin` takes the box of x[0] and the first measurement, `advance` takes one measurement more. `estimation.estimate` is
-nothing but these two in a `lax.scan`.
+`advance` is all there is: a start is a step whose past says nothing (`blank`), "hold" is the same step with y[k]
+missing. It is written over small arrays; `gsisio_jax.scalar` compiles it over single numbers.
 """
 
 from __future__ import annotations
@@ -10,381 +10,479 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from gsisio_jax.inclusion import AffineForm
-from gsisio_jax.inclusion.intersection import bound
-from gsisio_jax.inclusion.transforms import affine_with_slack
+from gsisio_jax.inclusion.expansion import AtomBounds, States, wider
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import (
     Interval,
     add,
     choose,
     entire_like,
-    held,
     image,
-    intersect,
     nan_to_unbounded,
+    plain_image,
     reach,
     slip,
     spread,
-    widen,
+    widened,
 )
-from gsisio_jax.interval.minmax import smaller
-from gsisio_jax.interval.xla import multiplied, once
+from gsisio_jax.interval.minmax import cut, raised, smaller
+from gsisio_jax.interval.primitives import matmul, scale
+from gsisio_jax.observer.bank import CancellationResidual, LinearBounds, Terms
 from gsisio_jax.observer.contractors import (
-    CancellationResidual,
-    Evidence,
-    LinearBounds,
-    Terms,
+    Affine,
+    affine_rows,
     centred_form,
     contract_affine_rows,
-    magnitude,
     solve_remainder,
 )
-from gsisio_jax.observer.measurement import current_input, in_box, inside, output_box, point, value_at
+from gsisio_jax.observer.domain import Domain, largest_magnitude
+from gsisio_jax.observer.initial import first_form, initial_boxes
+from gsisio_jax.observer.maps import Maps, at_point
+from gsisio_jax.observer.measurement import in_box, inside, output_box, point
 from gsisio_jax.observer.status import Source, Status, bit_mask
 from gsisio_jax.observer.types import Carry, Observer, StepOutput
 from gsisio_jax.plant.system import Noise
 
+_stage = jax.named_scope  # stages are counted one by one (benchmarks/size.py)
+
+
+def blank(observer: Observer, initial: Interval) -> Carry:
+    """The past of a first step: nothing is known but the initial box."""
+    n, l, m = observer.system.n, observer.system.l, observer.system.m
+    dtype = initial.dtype
+    maps = Maps.of(observer, dtype)
+    atoms = n + l if maps.expansion is None else len(maps.expansion.atoms)
+    entire = Interval.unchecked(jnp.full(atoms, -jnp.inf, dtype), jnp.full(atoms, jnp.inf, dtype))
+    zero = jnp.zeros(atoms, dtype)
+    noise = Noise.unchecked(*(entire_like(jnp.zeros(size, dtype)) for size in (n, l)))
+    values = (zero, zero) if observer.certificate.promised else (None, None)
+    h = AtomBounds(jnp.zeros((atoms, n), dtype), zero, zero + jnp.inf, entire, *values)
+    yes, no = jnp.asarray(True), jnp.asarray(False)
+    return Carry(initial, h, jnp.full(l, jnp.nan, dtype), jnp.zeros(m, dtype), noise, yes, no)
+
 
 @rounding.by_observer
-def begin(
-    observer: Observer, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool = False
-) -> tuple[Carry, StepOutput]:
-    """Step 0: the initial box met with the state bounds and with y[0]. Arrays must have their final dtype."""
-    bounds = observer.system.state_bounds
-    z = image(observer.T2, output_box(observer.system, y, u, noise.v))
-    scale = magnitude(y, initial.lower, initial.upper)
-    evidence = prior = Evidence(bounds, scale).meet(initial[None], Source.INITIAL)
-    form = _first_form(observer, bounds, u)  # valid on every smaller box: the first sweep serves the fallback too
-    fallback = prior if hold else contract_affine_rows(Evidence(bounds, scale), form, z)
-    for sweep in range(observer.sweeps):
-        form = _first_form(observer, evidence.box, u) if sweep == 0 else _free_output(observer, evidence.box, u)
-        evidence = contract_affine_rows(evidence, form, z)
-    return _finish(observer, evidence, fallback, None, None, y, u, noise, hold)
-
-
-@rounding.by_observer
-def advance(
-    observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool = False
-) -> tuple[Carry, StepOutput]:
-    """One step of design 4.3, from the box of x[k-1] to that of x[k]. Arrays must have their final dtype.
+def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool = False) -> Any:
+    """One step of design 4.3. Arrays must have their final dtype.
 
     After a conflict the recursion goes on from a box that does not contain the contradiction: y[k] and the state bounds
     alone (restart), or the past alone, with y[k] taken as missing (`hold`).
+
+    Returns:
+        The next `Carry`, and a `StepOutput`.
     """
-    evidence, fallback, d = _contract(observer, carry, y, u, noise)
+    maps = Maps.of(observer, y.dtype)
+    domain, fallback, d = _contract(maps, carry, y, u, noise)
     if hold:
-        fallback, _, _ = _contract(observer, carry, jnp.full_like(y, jnp.nan), u, noise)
-    return _finish(observer, evidence, fallback, carry, d, y, u, noise, hold)
+        fallback, _, _ = _contract(maps, carry, jnp.full_like(y, jnp.nan), u, noise)
+    return _finish(maps, domain, fallback, carry, d, y, u, noise, hold)
 
 
-def _contract(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[Evidence, Evidence, Interval]:
-    """Steps 1-6: the box of x[k], the box that y[k] and the state bounds alone give, and the box of d[k-1]."""
-    system, gains, inverses = observer.system, observer.gains, observer.inverses
-    before, bounds = carry.state, system.state_bounds
-    n = system.n
+class _Known(NamedTuple):
+    """What a step knows without any box of x: shared by all boxes that see the same record and noise.
 
-    # What is known beforehand, as boxes: everything of identity (*) but h(x[k-1]) and psi(x[k]).
+    Attributes:
+        terms: boxes that enter gains and left inverses linearly.
+        right, inputs: their part of the bounds of x[k], (K, n), and of d[k-1], (K, p).
+        z: box (q,) of T2 (y - D u - v).
+    """
+
+    terms: Terms
+    right: Interval
+    inputs: Interval
+    z: Interval
+
+
+@_stage("known")
+def _known(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) -> _Known:
+    system, bounds = observer.system, observer.system.state_bounds
     output = output_box(system, y, u, noise.v)
-    drift = add(image(system.B, point(carry.u)), carry.noise.w)
+    drift = add(image(system.B, point(carry.u)), carry.noise.w) if system.m else carry.noise.w
     seen = output_box(system, carry.y, carry.u, carry.noise.v)
     shift = Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
     terms = Terms(
         shift, output, image(observer.bounded_states, bounds), image(observer.bounded_inputs, system.input_bounds)
     )
-
-    # 1. Bounds of h = [f; g] on the old box, once for all gains (the last step has left them). 2. The right side of (*)
-    # without psi, jointly.
-    h = carry.h
-    both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), gains.flat(), inverses.flat())
-    bound = both.predict(h, before, terms)[0]
-    bound = held(bound)
-    right = Interval.unchecked(*(x[: gains.rows].reshape(-1, n) for x in (bound.lower, bound.upper)))
-    shape = inverses.residual.shape[:2]
-    d_fixed = Interval.unchecked(*(x[gains.rows :].reshape(shape) for x in (bound.lower, bound.upper)))
-    f_now = add(h.range[:n], drift)
-
-    # 3.-5. Contract from the state bounds; y[k] alone first, because a restart begins there.
-    z = image(observer.T2, output)
-    evidence = alone = Evidence(bounds, magnitude(y, carry.y, before.lower, before.upper))
-    form, affine = _first_form(observer, bounds, u), observer.first.affine_output
-    evidence = alone = contract_affine_rows(evidence, form, z)
-    missed = _Missed(observer, d_fixed)
-    evidence = _meet_first_boxes(observer, evidence, right, missed, u)
-    right = held(widen(right, missed.of(observer.rounding_constants.gains, evidence.box)))
-    d_fixed = held(widen(d_fixed, missed.of(observer.rounding_constants.inverses, evidence.box)))
-    for sweep in range(observer.sweeps):
-        if affine:
-            form = _first_form(observer, evidence.box, u)
-        elif sweep > 0:
-            form = _free_output(observer, evidence.box, u)
-        if sweep > 0 or affine:
-            evidence = contract_affine_rows(evidence, form, z)
-        evidence = evidence.meet(_solved(observer, right, form, evidence.box), Source.STATE)
-    if system.p:
-        # The paper's own loop x = f + B u + G d + w: no way to a first box, but a contraction of a correct one.
-        d, _ = _inputs(observer, evidence, d_fixed, form)
-        evidence = evidence.meet(add(f_now, image(system.G, d))[None], Source.DYNAMICS)
-
-    # 6. The certified bound, where both boxes lie in the region. (The form of the last sweep holds on smaller boxes.)
-    evidence, promised = _certified(observer, evidence, before, right, terms, missed, carry.u, u)
-    d, evidence = _inputs(observer, evidence, d_fixed, form)
-    d, evidence = _certified_input(observer, evidence, promised, missed, d)
-    d, evidence = _exact_input(observer, evidence, add(h.range, shift), terms, d, missed)
-    return evidence, alone, d
+    return _Known(
+        terms,
+        observer.gains.linear(terms),
+        observer.inverses.linear(terms),
+        plain_image(observer.T2, widened(output, system.l)),
+    )
 
 
-class _Missed:
+def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[Domain, Domain, Interval]:
+    """The box of x[k], the box that y[k] and the state bounds alone give, and the box of d[k-1]."""
+    observer, system = maps.observer, maps.observer.system
+    known, before, bounds = _known(observer, carry, y, u, noise), carry.state, system.state_bounds
+    size = largest_magnitude(y, carry.y, before.lower, before.upper)
+
+    # 1. Bounds of h = [f; g] on the old box were left by the last step. 2. The right side of (*) without psi, jointly.
+    with _stage("predict"):
+        past = maps.states(before)
+        right = _predicted(maps, observer.gains, past, carry, known.right)
+        d_fixed = _predicted(maps, observer.inverses, past, carry, known.inputs, ranges=False)
+
+    # 3. y[k] and the state bounds, which are all that a restart begins with, and the initial box, if this is the start;
+    # then what needs no box to begin with.
+    with _stage("initial"):
+        form = first_form(observer, bounds, u)
+        nothing = Domain.of(_typed(bounds, y.dtype), size)
+        alone = _output(nothing, maps.states(bounds), form, known.z)
+        domain = nothing.intersect(_if(carry.starts, before)[None], Source.INITIAL)
+        domain = _output(domain, maps.states(domain.box), first_form(observer, domain.box, u), known.z)
+        lost = _Lost(observer, d_fixed)
+        domain = initial_boxes(maps, domain, right, lost.inputs, u)
+        right = _plainly_wider(right, lost.radius(observer.rounding_constants.gains, domain.box))
+        d_fixed = _plainly_wider(d_fixed, lost.radius(observer.rounding_constants.inverses, domain.box))
+
+    # 4. Sweeps: T2 g on the box so far, every row solved for every state, and (*) solved for x[k].
+    with _stage("sweeps"):
+        states, psi = maps.states(domain.box), None
+        covered = set(observer.first.linear) >= set(range(observer.gains.residual.shape[0]))
+        for sweep in range(observer.sweeps):
+            rows = None
+            if sweep == 0 or observer.first.affine_output:
+                form = first_form(observer, domain.box, u)
+                psi = Affine(form.slope - observer.C, form.center, form.radius)
+                if sweep == 0 and covered and not observer.first.affine_output:
+                    continue  # the initial contraction was this
+            else:
+                atoms = maps.free_bounds(states, domain.box, u)
+                form = affine_rows(maps.free, states, atoms)
+                psi = affine_rows(maps.remainder, states, atoms)
+            if sweep > 0 or observer.first.affine_output:
+                rows, slack = contract_affine_rows(states, form, known.z)
+                domain = domain.record_margin(slack, Source.OUTPUT)
+            solved = solve_remainder(observer.gains.remainder, right, psi, states, maps.terms)
+            domain = domain.intersect(solved, Source.STATE, quiet=rows)
+            states = maps.states(domain.box)
+        domain = _open_loop(maps, domain, past, carry, known.terms)
+
+    # 5. The certified bound, where both boxes lie in the region.
+    domain, promised = _certified(maps, domain, past, carry, right, known, lost, u)
+    with _stage("inputs"):
+        states = maps.states(domain.box)
+        d, domain = _inputs(maps, domain, states, d_fixed, psi)
+        d, domain = _certified_input(maps, domain, states, promised, known, lost, d)
+        d, domain = _exact_input(maps, domain, past, carry, known.terms, d, lost)
+    return domain, alone, d
+
+
+def _output(domain: Domain, states: States, form: Affine, z: Interval) -> Domain:
+    """Contract with ``T2 g(x) in z``."""
+    rows, slack = contract_affine_rows(states, form, z)
+    return domain.record_margin(slack, Source.OUTPUT).intersect(None, Source.STATE, quiet=rows)
+
+
+def _plainly_wider(box: Interval, radius: Any) -> Interval:
+    """A linear bound, wider by what gains leave; the rounding of one more sum is in what was widened before."""
+    return box if radius is None else Interval.unchecked(box.lower - radius, box.upper + radius)
+
+
+def _if(mask: Any, box: Interval) -> Interval:
+    """The box where the mask holds, else everything."""
+    return choose(mask, box, entire_like(box))
+
+
+def _predicted(
+    maps: Maps, bank: LinearBounds, past: States, carry: Carry, known: Interval, ranges: bool = True
+) -> Interval:
+    """All terms of a bank but those in x[k], (K, r); slopes are combined before the box is applied, so that what
+    cancels cancels exactly: that is what keeps widths finite on nonlinear systems (design 4.3, step 2)."""
+    rows, shape = bank.residual.reshape(-1, bank.residual.shape[-1]), bank.residual.shape[:2]
+    found = maps.rows(rows).bounds(past, carry.h) if ranges else maps.rows(rows).joint_box(past, carry.h)
+    n = maps.observer.system.n
+    # Rows that use a measurement that is not believed say nothing.
+    uses = (rows[:, n:] != 0).any(-1)
+    known = _if(jnp.logical_or(carry.believed, ~uses), Interval.unchecked(known.lower.ravel(), known.upper.ravel()))
+    return Interval.unchecked((found.lower + known.lower).reshape(shape), (found.upper + known.upper).reshape(shape))
+
+
+def _open_loop(maps: Maps, domain: Domain, past: States, carry: Carry, terms: Terms) -> Domain:
+    """``x = f + B u + G d + w`` in the rows that no input without bounds reaches."""
+    system = maps.observer.system
+    limits = system.input_bounds
+    known = all(isinstance(side, np.ndarray) for side in (system.G, limits.lower, limits.upper))
+    if not known:
+        return domain
+    finite = np.isfinite(limits.lower) & np.isfinite(limits.upper)
+    plain = ~((system.G != 0) & ~finite).any(axis=1)
+    if not plain.any():
+        return domain
+    weights = np.eye(system.n, system.n + system.l)[plain]
+    drift = terms.shift[: system.n][np.flatnonzero(plain)]
+    if (system.G[plain] != 0).any():
+        drift = add(
+            drift,
+            image(
+                system.G[plain], Interval.unchecked(*(jnp.where(finite, s, 0) for s in (limits.lower, limits.upper)))
+            ),
+        )
+    found = maps.rows(weights).bounds(past, carry.h)
+    low, high = entire_like(domain.box).lower, entire_like(domain.box).upper
+    for i, j in enumerate(np.flatnonzero(plain)):
+        low = low.at[j].set(found.lower[i] + drift.lower[i])
+        high = high.at[j].set(found.upper[i] + drift.upper[i])
+    return domain.intersect(Interval.unchecked(low, high)[None], Source.DYNAMICS)
+
+
+class _Lost:
     """How far the bounds can be off because the gains do not cancel exactly (design 6).
 
     ``|d[k-1]| <= inputs + input_state |x[k]|`` from every left inverse, and by the input bounds.
     """
 
     def __init__(self, observer: Observer, d_fixed: Interval):
-        rounding_constants, bounds = observer.rounding_constants, observer.system.input_bounds
-        self.rounding_constants, self.limit = rounding_constants, reach(bounds)
-        self.inputs = jnp.full_like(self.limit, jnp.inf)
+        self.constants, self.limit = observer.rounding_constants, reach(observer.system.input_bounds)
+        self.inputs = jnp.asarray(self.limit)
         if rounding.outward():
-            for i, j in enumerate(rounding_constants.direct):
-                self.inputs = jnp.minimum(self.inputs, slip(rounding_constants.input_inverses[i], reach(d_fixed[j])))
+            for i, j in enumerate(self.constants.direct):
+                self.inputs = cut(self.inputs, slip(self.constants.input_inverses[i], reach(d_fixed[j])))
 
-    def input_reach(self, box: Interval) -> Any:
-        """Bound of ``|d[k-1]|``, (p,), from a box of x[k]."""
-        return once(jnp.minimum(self.limit, self.inputs + slip(self.rounding_constants.input_state, reach(box))))
+    def reaches(self, box: Interval) -> tuple[Any, Any]:
+        """Bounds of ``|x[k]|`` (n,) and ``|d[k-1]|`` (p,), from a box of x[k]."""
+        x = reach(box)
+        return x, cut(jnp.asarray(self.limit), self.inputs + slip(self.constants.input_state, x))
 
-    def of(self, residual: CancellationResidual, box: Interval) -> Any:
+    def radius(self, residual: CancellationResidual, box: Interval) -> Any:
         """Radius (K, r) by which a bank's bounds are to be widened; None to nearest."""
         if not rounding.outward():
             return None
-        return residual.radius(reach(box), self.input_reach(box))
+        return slip(jnp.concatenate([residual.x, residual.d], -1), jnp.concatenate(self.reaches(box)))
 
     def of_inputs(self, weights: Any, box: Interval) -> Any:
         """The same for rows that leave only d[k-1], (..., p)."""
-        return slip(weights, self.input_reach(box)) if rounding.outward() else None
-
-
-def _meet_first_boxes(observer: Observer, evidence: Evidence, right: Interval, missed: _Missed, u: Any) -> Evidence:
-    """Bounds that need no box to begin with, for x[k] is unknown still, and with it what the gains leave of it: the
-    contraction |N_z| R < 1 on the state bounds, and the linear form of T2 g there."""
-    first, gains, rounding_constants = observer.first, observer.gains, observer.rounding_constants
-    if rounding.outward():
-        # What d leaves, but for its part in x[k], which is in the cancellation residual of `first`.
-        inputs = jnp.minimum(missed.inputs, missed.limit)
-        right = widen(right, slip(rounding_constants.gains.d, inputs))
-    if first.gains:
-        chosen, N_z, left = _taken(first.gains, right, gains.remainder, first.cancellation_residual)
-        bounded = _psi_box(observer, u)
-        boxes = jax.vmap(
-            lambda box, N, V, L: centred_form(box, N, V, _psi(observer, u), bounded, observer.system.state_bounds, L)
-        )(chosen, N_z, first.inverses, left)
-        boxes = choose(in_box(u, observer.u_region), boxes, entire_like(boxes))
-        evidence = evidence.meet(boxes, Source.STATE)
-    if first.linear and first.form is not None:
-        chosen, N_z = _taken(first.linear, right, gains.remainder)
-        boxes = image(first.maps, add(chosen, image(-N_z, first.form.offset)))
-        if rounding.outward():
-            far = jnp.minimum(spread(first.bounds, reach(boxes)), reach(evidence.box))
-            boxes = widen(boxes, slip(first.left, far))
-        evidence = evidence.meet(boxes, Source.STATE)
-    return evidence
-
-
-def _taken(indices: tuple[int, ...], *stacks: Any) -> Any:
-    """Entries of stacks, without a gather."""
-    return jax.tree.map(lambda x: jnp.stack([x[k] for k in indices]), stacks)
-
-
-def _solved(observer: Observer, right: Interval, form: AffineForm, box: Interval) -> Interval:
-    """Box (K, n) of x[k] from ``x + N_z psi(x) in right``; where psi is affine it is known as it stands."""
-    if not observer.first.affine_output:
-        return solve_remainder(observer.gains, right, form, observer.C, box)
-    psi = add(image(form.slope - observer.C, box), form.offset)
-    return add(right, image(-observer.gains.remainder, psi))
-
-
-def _certified(
-    observer: Observer,
-    evidence: Evidence,
-    before: Interval,
-    right: Interval,
-    terms: Terms,
-    missed: _Missed,
-    u_before: Any,
-    u: Any,
-) -> tuple[Evidence, _Promised]:
-    """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""
-    certificate, region, system = observer.certificate, observer.certificate.region, observer.system
-    applies = jnp.asarray(False)
-    if certificate.promised:
-        applies = inside(before, region) & inside(evidence.box, region)
-        applies = applies & in_box(u_before, observer.u_region) & in_box(u, observer.u_region)
-    # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
-    c = jnp.where(applies, before.center, region.center)
-    far = rounding.up(jnp.maximum(before.upper - c, c - before.lower))
-    promised = _Promised(applies, c, jnp.where(applies, far, 0), None, terms)
-    if not certificate.promised:
-        return evidence, promised
-    promised = promised._replace(value=value_at(system.maps, c, u_before))
-    gain = jax.tree.map(lambda x: x[0], observer.gains)
-    around = widen(
-        _around(gain, observer.rounding_constants.growth, promised),
-        _first(missed.of(observer.rounding_constants.gains, evidence.box)),
-    )
-    joint, slack = intersect(right[0], around)
-    evidence = evidence.weigh(jnp.where(applies, slack, jnp.inf), Source.STATE)
-    safe = choose(applies, evidence.box, Interval.unchecked(c, c))
-    box = centred_form(joint, gain.remainder, observer.region_inverse, _psi(observer, u), _psi_box(observer, u), safe)
-    return evidence.meet(choose(applies, box, entire_like(box))[None], Source.CERTIFICATE), promised
-
-
-def _certified_input(
-    observer: Observer, evidence: Evidence, promised: _Promised, missed: _Missed, d: Interval
-) -> tuple[Interval, Evidence]:
-    """The same centred form for d[k-1] with the first left inverse."""
-    certificate = observer.certificate
-    if not certificate.promised or not observer.system.p:
-        return d, evidence
-    inverse = jax.tree.map(lambda x: x[0], observer.inverses)
-    around = _around(inverse, observer.rounding_constants.input_growth, promised)
-    around = widen(around, _first(missed.of(observer.rounding_constants.inverses, evidence.box)))
-    box = add(image(inverse.state, evidence.box), around)
-    met, slack = intersect(d, choose(promised.applies, nan_to_unbounded(box), entire_like(box)))
-    return met, evidence.weigh(slack, Source.INPUT)
+        return slip(weights, self.reaches(box)[1]) if rounding.outward() else None
 
 
 class _Promised(NamedTuple):
-    """Where the promise of the certificate applies; the old box there, by centre and radius; [f; g] at that centre."""
+    """Where the promise of the certificate applies; around the centre of the old box, its radius, and atoms there."""
 
     applies: Any
     center: Any
+    slip: Any
     radius: Any
-    value: Any
-    terms: Terms
+    atoms: Any
 
 
-def _around(row: LinearBounds, slope: Any, promised: _Promised) -> Interval:
+@_stage("certified")
+def _certified(
+    maps: Maps, domain: Domain, past: States, carry: Carry, right: Interval, known: _Known, lost: _Lost, u: Any
+) -> tuple[Domain, _Promised | None]:
+    """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""
+    observer, certificate, before = maps.observer, maps.observer.certificate, carry.state
+    if not certificate.promised:
+        return domain, None
+    region = certificate.region
+    applies = inside(before, region) & inside(domain.box, region) & carry.believed & ~carry.starts
+    applies = applies & in_box(carry.u, observer.u_region) & in_box(u, observer.u_region)
+    # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
+    c = jnp.where(applies, past.center, jnp.asarray(region.center, right.dtype))
+    radius = jnp.where(applies, past.radius, 0)
+    promised = _Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.slip))
+    gains, constants = observer.gains, observer.rounding_constants
+    around = _around(maps, gains.residual[0], constants.growth, promised, known.right[0])
+    around = _plainly_wider(around, _first(lost.radius(constants.gains, domain.box)))
+    joint, slack = _met(right[0], around)
+    domain = domain.record_margin(jnp.where(applies, slack, jnp.inf), Source.STATE)
+    joint = choose(applies, joint, Interval.unchecked(c, c))
+    safe = choose(applies, domain.box, Interval.unchecked(c, c))
+
+    def psi(x: Any) -> tuple[Any, Any]:
+        return at_point(maps.remainder, x, wider(abs(x), maps.terms), *maps.free_at(x, u))
+
+    box = centred_form(joint, gains.remainder[0], observer.region_inverse, psi, joint.center, safe, maps.terms)
+    return domain.intersect(_if(applies, box)[None], Source.CERTIFICATE), promised
+
+
+def _met(a: Interval, b: Interval) -> tuple[Interval, Any]:
+    """Intersection and slack; the first box where they miss each other."""
+    lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
+    empty = upper < lower
+    slack = smaller(a.upper - b.lower, b.upper - a.lower)
+    return Interval.unchecked(jnp.where(empty, a.lower, lower), jnp.where(empty, a.upper, upper)), slack
+
+
+def _around(maps: Maps, weights: Any, slope: Any, promised: _Promised, known: Interval) -> Interval:
     """A linear bound without its terms in x[k]: its value at the centre of the old box, give or take ``slope radius``.
 
     No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
     """
-    at = image(row.residual, promised.value)
-    return add(widen(at, spread(slope, promised.radius)), row.linear(promised.terms))
+    center, radius = at_point(maps.rows(weights), promised.center, promised.slip, *promised.atoms)
+    radius = radius + spread(slope, promised.radius)
+    radius = radius + wider(abs(center) + radius, 0)
+    return Interval.unchecked(center - radius + known.lower, center + radius + known.upper)
 
 
 def _first(radius: Any) -> Any:
     return None if radius is None else radius[0]
 
 
-def _inputs(observer: Observer, evidence: Evidence, fixed: Interval, form: AffineForm) -> tuple[Interval, Evidence]:
+def _inputs(maps: Maps, domain: Domain, states: States, fixed: Interval, psi: Affine) -> tuple[Interval, Domain]:
     """Box of d[k-1] from every left inverse, given the box of x[k] (design 4.5)."""
-    inverses, box = observer.inverses, evidence.box
-    # state x[k] - remainder psi(x[k]) with psi = (S - C) x + [e], slopes combined before the box is applied.
-    difference = once(form.slope - observer.C)
-    slope = once(inverses.state - multiplied(inverses.remainder, difference))
-    now = add(image(slope, box), image(-inverses.remainder, form.offset), fixed)
-    if rounding.outward():
-        # Of the slopes before they cancelled.
-        lost = slip(abs(inverses.state), reach(box)) + slip(abs(inverses.remainder), slip(abs(difference), reach(box)))
-        now = widen(now, rounding.error(lost, difference.shape[0] + 6.0))
-    d = Evidence(observer.system.input_bounds, evidence.scale).meet(now, Source.INPUT)
-    return d.box, evidence.weigh(d.slacks[0], Source.INPUT) if d.slacks else evidence
+    observer = maps.observer
+    inverses, limits = observer.inverses, _typed(observer.system.input_bounds, fixed.dtype)
+    # state x[k] - remainder psi(x[k]) with psi = D x + [e], slopes combined before the box is applied.
+    slope = inverses.state - matmul(inverses.remainder, psi.slope)  # (K, p, n)
+    middle = matmul(slope, states.center) - matmul(inverses.remainder, psi.center)
+    loose = scale(abs(slope), states.radius).sum(-1) + scale(abs(inverses.remainder), psi.radius).sum(-1)
+    # What rounding the slope has lost, where it was combined.
+    combined = jnp.where((inverses.remainder != 0).any(-1, keepdims=True), abs(inverses.state), 0)
+    loose = loose + scale(combined, states.slip).sum(-1)
+    now = Interval.unchecked(fixed.lower + (middle - loose), fixed.upper + (middle + loose))
+    d = Domain.of(limits, 0.0).intersect(now, Source.INPUT)
+    return d.box, domain.taken(d)
+
+
+def _typed(box: Interval, dtype: Any) -> Interval:
+    return Interval.unchecked(jnp.asarray(box.lower, dtype), jnp.asarray(box.upper, dtype))
+
+
+def _certified_input(
+    maps: Maps,
+    domain: Domain,
+    states: States,
+    promised: _Promised | None,
+    known: _Known,
+    lost: _Lost,
+    d: Interval,
+) -> tuple[Interval, Domain]:
+    """The same centred form for d[k-1] with the first left inverse."""
+    observer = maps.observer
+    if promised is None or not observer.system.p:
+        return d, domain
+    inverses, constants = observer.inverses, observer.rounding_constants
+    around = _around(maps, inverses.residual[0], constants.input_growth, promised, known.inputs[0])
+    around = _plainly_wider(around, _first(lost.radius(constants.inverses, domain.box)))
+    now = plain_image(inverses.state[0], states.wide)
+    box = Interval.unchecked(now.lower + around.lower, now.upper + around.upper)
+    met, slack = _met(d, _if(promised.applies, box))
+    return met, domain.record_margin(slack, Source.INPUT)
 
 
 def _exact_input(
-    observer: Observer, evidence: Evidence, known: Interval, terms: Terms, d: Interval, missed: _Missed | None = None
-) -> tuple[Interval, Evidence]:
-    """The exact box of d[k-1] for ``[G; H] d`` in a box, that of ``[x[k]; 0] - known`` (paper, Lemma 3; design 4.5)."""
-    exact, box = observer.exact, evidence.box
-    if not observer.system.p:
-        return d, evidence
-    zero = jnp.zeros(observer.system.l, box.dtype)
-    explained = add(
-        Interval.unchecked(jnp.concatenate([box.lower, zero]), jnp.concatenate([box.upper, zero])),
-        Interval.unchecked(-known.upper, -known.lower),
+    maps: Maps, domain: Domain, past: States, carry: Carry, terms: Terms, d: Interval, lost: _Lost
+) -> tuple[Interval, Domain]:
+    """The exact box of d[k-1] for ``[G; H] d`` in the box of ``[x[k]; 0] - [f + B u + w; g + D u + v - y][k-1]``."""
+    n, l = maps.observer.system.n, maps.observer.system.l
+    known = maps.rows(np.eye(n + l)).natural(past, carry.h)
+    known = Interval.unchecked(known.lower + terms.shift.lower, known.upper + terms.shift.upper)
+    zero = jnp.zeros(l, d.dtype)
+    explained = Interval.unchecked(
+        jnp.concatenate([domain.box.lower, zero]) - known.upper, jnp.concatenate([domain.box.upper, zero]) - known.lower
     )
-    rows = add(image(exact.rows, explained), image(exact.known, terms.known))
-    rows = rows if missed is None else widen(rows, missed.of_inputs(observer.rounding_constants.rows, box))
-    met = Evidence(d, evidence.scale).meet(rows, Source.INPUT)
-    evidence = evidence.weigh(met.slacks[0], Source.INPUT)
-    # Some d must reach the box at all: every combination of rows that is free of d contains 0.
-    balance = add(image(exact.circuits, explained), image(exact.circuits_known, terms.known))
-    balance = balance if missed is None else widen(balance, missed.of_inputs(observer.rounding_constants.circuits, box))
-    return met.box, evidence.weigh(smaller(balance.upper, -balance.lower), Source.BALANCE)
+    new = _beyond_inverses(maps.observer)
+    return exact_input(maps.observer, domain, explained, terms.known, d, lost, carry.believed, new)
 
 
-def _finish(
+def exact_input(
     observer: Observer,
-    evidence: Evidence,
-    fallback: Evidence,
-    carry: Carry | None,
-    d: Interval | None,
-    y: Any,
-    u: Any,
-    noise: Noise,
-    hold: bool,
+    domain: Domain,
+    explained: Interval,
+    known: Interval,
+    d: Interval,
+    lost: Any,
+    believed: Any,
+    new: Any = True,
+) -> tuple[Interval, Domain]:
+    """The exact box of d[k-1] for ``[G; H] d in explained`` (paper, Lemma 3; design 4.5), and what it says of conflicts.
+
+    Args:
+        observer: for its rows.
+        domain: of x[k].
+        explained: box (n + l,).
+        known: bounds of the inputs that have them (b,).
+        d: what is known of d[k-1] so far, (p,).
+        lost: bounds what the rows leave of d[k-1]; None if they leave nothing.
+        believed: the measurement behind `explained` is.
+        new: mask (K, p) of rows that say something new.
+    """
+    exact, constants = observer.exact, observer.rounding_constants
+    if not observer.system.p:
+        return d, domain
+    terms = explained.shape[0] + known.shape[0]
+    joined = widened(_joined(explained, known), terms)
+
+    def image_of(rows: Any, of_known: Any, residual: Any) -> Interval:
+        found = plain_image(jnp.concatenate([rows, of_known], -1), joined)
+        return found if lost is None else _plainly_wider(found, lost.of_inputs(residual, domain.box))
+
+    rows = _if(new, image_of(exact.rows, exact.known, constants.rows))
+    met = Domain.of(d, 0.0).intersect(_if(believed, rows), Source.INPUT)
+    domain = domain.taken(met)
+    # Some d must reach the box at all: every combination of rows that is free of d contains 0.
+    balance = image_of(exact.circuits, exact.circuits_known, constants.circuits)
+    slack = smaller(balance.upper, -balance.lower)
+    return met.box, domain.record_margin(jnp.where(believed, slack, jnp.inf), Source.BALANCE)
+
+
+def _joined(*boxes: Interval) -> Interval:
+    return Interval.unchecked(*(jnp.concatenate([getattr(b, side) for b in boxes]) for side in ("lower", "upper")))
+
+
+def _beyond_inverses(observer: Observer) -> Any:
+    """Which rows of the exact box (K, p) are not those of a left inverse as well, which bounds f and g jointly."""
+    exact, inverses = observer.exact.rows, observer.inverses
+    if not (isinstance(exact, np.ndarray) and isinstance(inverses.residual, np.ndarray)):
+        return True
+    direct = [j for j in range(len(inverses.residual)) if not (inverses.remainder[j].any() or inverses.output[j].any())]
+    old = np.zeros(exact.shape[:2], bool)
+    for j in direct:
+        old |= (exact == -inverses.residual[j]).all(-1)
+    return ~old
+
+
+@_stage("finish")
+def _finish(
+    maps: Maps, domain: Domain, fallback: Domain, carry: Carry, d: Interval, y: Any, u: Any, noise: Noise, hold: bool
 ) -> tuple[Carry, StepOutput]:
     """Choose what to believe after a conflict, and report."""
-    system, certificate = observer.system, observer.certificate
-    conflict = evidence.conflict
+    observer, system = maps.observer, maps.observer.system
+    certificate, dtype = observer.certificate, y.dtype
+    conflict = domain.conflict
     # Even the fallback may contradict itself (y[k] against the state bounds): then only the state bounds are left.
-    restart = choose(fallback.conflict, system.state_bounds, fallback.box)
-    state = choose(conflict, restart, evidence.box)
+    restart = choose(fallback.conflict, _typed(system.state_bounds, dtype), fallback.box)
+    state = _limited(choose(conflict, restart, domain.box))
     believed = ~conflict if hold else ~conflict | ~fallback.conflict
-    y_kept = jnp.where(believed, y, jnp.nan)
 
-    d = system.input_bounds if d is None else choose(conflict, system.input_bounds, d)
-    h = bound(system.maps, observer.bounds, observer.abstraction)(state, u)
-    d_now = current_input(observer.current, h, state, output_box(system, y_kept, u, noise.v))
+    d = choose(conflict, _typed(system.input_bounds, dtype), d)
+    states = maps.states(state)
+    h = maps.bounds(states, state, u)
+    d_now = _current_input(maps, states, h, output_box(system, y, u, noise.v), believed)
 
-    applies = in_box(u, observer.u_region)
-    if carry is not None:
-        applies = applies & in_box(carry.u, observer.u_region)
+    applies = in_box(u, observer.u_region) & (carry.starts | in_box(carry.u, observer.u_region))
     if certificate.region_matters:
-        applies = applies & inside(state, certificate.region)
-        if carry is not None:
-            applies = applies & inside(carry.state, certificate.region)
+        region = certificate.region
+        applies = applies & inside(state, region) & (carry.starts | inside(carry.state, region))
     bits = (
         (conflict, Status.CONFLICT),
         (~jnp.isfinite(y).all(), Status.MISSING),
         (~(jnp.isfinite(state.lower) & jnp.isfinite(state.upper)).all(), Status.UNBOUNDED),
         (~applies, Status.OUTSIDE_REGION),
     )
-    return Carry(state, h, y_kept, u, noise), StepOutput(state, d, d_now, bit_mask(bits), *evidence.tightest())
+    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed)
+    return after, StepOutput(state, d, d_now, bit_mask(bits), *domain.report())
 
 
-def _free_output(observer: Observer, box: Interval, u: Any) -> AffineForm:
-    """Bounds of T2 g on a box of x[k]."""
-    return bound(_free_map(observer), observer.bounds, observer.output_abstraction)(box, u)
+def _limited(box: Interval) -> Interval:
+    """Numbers so large that the next step would overflow count as infinite."""
+    most = float(jnp.finfo(box.dtype).max) ** (2 / 3)
+    return Interval.unchecked(
+        jnp.where(box.lower > -most, box.lower, -jnp.inf), jnp.where(box.upper < most, box.upper, jnp.inf)
+    )
 
 
-def _first_form(observer: Observer, box: Interval, u: Any) -> AffineForm:
-    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes. For x in `box`."""
-    known, slack = observer.first.form, observer.first.slack
-    if known is None:
-        known, slack = affine_with_slack(_free_map(observer))(observer.system.state_bounds, u)
-    if not rounding.outward():
-        return known
-    return AffineForm(known.slope, widen(known.offset, slip(slack, reach(box))), known.range)
-
-
-def _free_map(observer: Observer) -> Any:
-    return lambda x, u: observer.T2 @ observer.system.measurement(x, u)
-
-
-def _psi(observer: Observer, u: Any) -> Any:
-    """The remainder T2 g(x) - C x."""
-    return lambda x: observer.T2 @ observer.system.measurement(x, u) - observer.C @ x
-
-
-def _psi_box(observer: Observer, u: Any) -> Any:
-    """The same at a point, as a box."""
-    if not rounding.outward():
-        return lambda x: point(_psi(observer, u)(x))
-
-    def box(x: Any) -> Interval:
-        g = value_at(observer.system.measurement, x, u)
-        sides = (jnp.concatenate([g.lower, x]), jnp.concatenate([g.upper, x]))
-        return image(jnp.concatenate([observer.T2, -observer.C], axis=1), Interval.unchecked(*sides))
-
-    return box
+def _current_input(maps: Maps, states: States, h: AtomBounds, output: Interval, believed: Any) -> Interval:
+    """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
+    current, n = maps.observer.current, maps.observer.system.n
+    weights = (
+        jnp.concatenate([jnp.zeros((current.shape[0], n)), -current], 1)
+        if not isinstance(current, np.ndarray)
+        else np.concatenate([np.zeros((len(current), n)), -current], 1)
+    )
+    found = maps.rows(weights).bounds(states, h)
+    seen = plain_image(current, widened(output, output.shape[0]))
+    return _if(believed, nan_to_unbounded(Interval.unchecked(found.lower + seen.lower, found.upper + seen.upper)))

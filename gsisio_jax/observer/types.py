@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion import AffineForm
+from gsisio_jax.inclusion.expansion import AtomBounds
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.rounding import Rounding
+from gsisio_jax.observer.bank import CancellationResidual, LinearBounds
 from gsisio_jax.observer.certificate import Certificate
-from gsisio_jax.observer.contractors import CancellationResidual, LinearBounds
 from gsisio_jax.plant.system import Noise, System
 
 
@@ -212,18 +213,22 @@ class Carry(eqx.Module):
     """What one step hands to the next; a pytree of arrays that can be saved and resumed.
 
     Attributes:
-        state: box of x[k], (n,).
-        h: affine bounds of [f; g] on that box, (n + l,).
-        y: (l,) measurement k, NaN where missing or not believed.
+        state: box of x[k], (n,); before the first step, the initial box.
+        h: bounds of f and g on that box (prediction form: affine forms of [f; g]).
+        y: (l,) measurement k, NaN where missing.
         u: (m,) known input k.
         noise: bounds of w[k] and v[k].
+        starts: nothing has been measured yet.
+        believed: no conflict has taken y[k] out of what is believed.
     """
 
     state: Interval
-    h: AffineForm
+    h: AtomBounds | AffineForm
     y: Any
     u: Any
     noise: Noise
+    starts: Any
+    believed: Any
 
 
 class StepOutput(eqx.Module):

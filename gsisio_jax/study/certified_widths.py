@@ -9,7 +9,7 @@ import numpy as np
 
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.certificate import Certificate
-from gsisio_jax.observer.estimation import AnyObserver
+from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.axes import Axis, Layout, bare
 from gsisio_jax.study.labels import Labels

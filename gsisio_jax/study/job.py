@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 
 from gsisio_jax._extras import need
 from gsisio_jax._version import __version__
-from gsisio_jax.observer.estimation import AnyObserver
+from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.study import cluster, devices
 from gsisio_jax.study.axes import Layout
 from gsisio_jax.study.certified_widths import along, beside, promised

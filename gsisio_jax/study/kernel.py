@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import is_dataclass
-from functools import partial
+from functools import cache
 from typing import Any
 
 import equinox as eqx
@@ -13,8 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.observer import estimation
-from gsisio_jax.observer.estimation import AnyObserver
+from gsisio_jax import scalar
+from gsisio_jax.observer import scan
+from gsisio_jax.observer.checks import AnyObserver
+from gsisio_jax.observer.fixed import Fixed, chosen, fixed
+from gsisio_jax.scalar.options import cpu_options
 from gsisio_jax.study.axes import bare
 from gsisio_jax.study.reduction_base import Context, Kept, Reduction
 from gsisio_jax.study.row_source import Rows
@@ -49,13 +52,25 @@ def run_cases(
     Returns:
         Arrays (B, ...) by name, not waited for.
     """
-    return _run(observer, dict(varying), dict(shared), rows, reductions, hold)
+    static, traced = fixed(observer)
+    return _compiled()(static, traced, dict(varying), dict(shared), rows, reductions, hold)
 
 
-@partial(jax.jit, static_argnames=("rows", "reductions", "hold"))
+@cache  # not at import: asking for the backend starts JAX
+def _compiled() -> Any:
+    return jax.jit(_run, static_argnames=("static", "rows", "reductions", "hold"), compiler_options=cpu_options())
+
+
 def _run(
-    observer: AnyObserver, varying: Any, shared: Any, rows: Rows, reductions: tuple[Reduction, ...], hold: bool
+    static: Fixed | None,
+    traced: Any,
+    varying: Any,
+    shared: Any,
+    rows: Rows,
+    reductions: tuple[Reduction, ...],
+    hold: bool,
 ) -> Any:
+    observer = chosen(static, traced)
     return jax.vmap(lambda one: _case(observer, eqx.combine(one, shared), rows, reductions, hold))(varying)
 
 
@@ -69,7 +84,7 @@ def _case(
         carry, carried, states = state
         k, given = step
         row, carried = source.following(observer, case, carried, k, given)
-        carry, out = estimation.advance(observer, carry, row.y, row.u, row.noise, hold)
+        carry, out = scan.advance(observer, carry, row.y, row.u, row.noise, hold)
         context = Context(steady, row.x, row.d)
         after, kept = [], []
         for reduction, before in zip(reductions, states, strict=True):
@@ -87,7 +102,7 @@ def _case(
 
     running = [None if isinstance(r, Kept) else state for r, state in zip(reductions, states, strict=True)]
     steps = jnp.arange(1, source.steps(case), dtype=jnp.int32), source.given(case)
-    (_, carried, running), kept = jax.lax.scan(body, (carry, carried, running), steps)
+    (_, carried, running), kept = scalar.scan(body, (carry, carried, running), steps)
     count = source.steps(case) if length is None else length
     results: dict[str, Any] = {}
     for reduction, start, state, rest in zip(reductions, states, running, kept, strict=True):
@@ -102,7 +117,7 @@ def _start(
 ) -> tuple[Any, Any, list[Any], Any]:
     """Step 0: the carry of the observer, that of the source, the states of the reductions, and the boxes."""
     row, carried = source.first(observer, case)
-    carry, out = estimation.begin(observer, case["initial"], row.y, row.u, row.noise, hold)
+    carry, out = scan.begin(observer, case["initial"], row.y, row.u, row.noise, hold)
     context, zero = Context(case["steady"], row.x, row.d), jnp.int32(0)
     states = [r.row(out, zero, context) if isinstance(r, Kept) else r.init(out, context) for r in reductions]
     return carry, carried, jax.tree.map(jnp.asarray, states), out

@@ -12,8 +12,9 @@ import numpy as np
 from gsisio_jax._extras import need
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.rounding import Rounding
-from gsisio_jax.observer import estimation
-from gsisio_jax.observer.estimation import AnyObserver, OnConflict
+from gsisio_jax.observer import checks
+from gsisio_jax.observer.checks import AnyObserver
+from gsisio_jax.observer.estimation import OnConflict
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.axes import RUN, Axis, Layout, prepare
 from gsisio_jax.study.containment import Containment, TrueRun
@@ -107,8 +108,8 @@ def monte_carlo(
     Source: design 2, 7 and 11.
     """
     need("xarray", extra="study", purpose="a Monte Carlo study")
-    observer = estimation.rounded(CALL, observer, rounding)
-    hold = estimation.check_on_conflict(CALL, on_conflict)
+    observer = checks.rounded(CALL, observer, rounding)
+    hold = checks.check_on_conflict(CALL, on_conflict)
     if on_miss not in ("raise", "record"):
         raise ValueError(f'{CALL}: `on_miss` must be "raise" or "record", got {on_miss!r}')
     check_confidence(CALL, confidence)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer import estimation
+from gsisio_jax.observer import scan
 from gsisio_jax.plant.simulation import measured, moved
 from gsisio_jax.study import containment
 from gsisio_jax.study.containment import BROKEN
@@ -58,7 +58,7 @@ class Simulated(Rows):
         return row, (key, plant, _first_break(jnp.full(2, -1, jnp.int32), 0, start | outside, row))
 
     def given(self, case: Any) -> Any:
-        noise = jax.tree.map(lambda a: a[1:], estimation.noise_rows(case["noise"]))
+        noise = jax.tree.map(lambda a: a[1:], scan.noise_rows(case["noise"]))
         d = None if case["d"] is None else case["d"][1:]
         return case["u"][1:], noise, d
 
@@ -100,7 +100,7 @@ class Simulated(Rows):
     def _measure(self, observer: Any, case: Any, key: Any, k: Any, x: Any, before: Any, given: Any) -> Any:
         """Row k; what moves the plant on to x[k+1]: x, d, u, w and its bounds; and what is outside of its bounds."""
         system, (u, now, d) = observer.system, given
-        noise = estimation.noise_of_row(case["noise"], now)
+        noise = scan.noise_of_row(case["noise"], now)
         key_d, key_noise = jax.random.split(jax.random.fold_in(key, k))
         if self.d is not None:
             d = jnp.asarray(self.d(key_d, k, x), x.dtype)
@@ -119,7 +119,7 @@ class Simulated(Rows):
 
 
 def _row(case: Any, k: int) -> Any:
-    noise = jax.tree.map(lambda a: a[k], estimation.noise_rows(case["noise"]))
+    noise = jax.tree.map(lambda a: a[k], scan.noise_rows(case["noise"]))
     return case["u"][k], noise, None if case["d"] is None else case["d"][k]
 
 

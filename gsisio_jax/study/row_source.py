@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.observer import estimation
+from gsisio_jax.observer import scan
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.reduction_base import Variable
 
@@ -80,19 +80,19 @@ class Recorded(Rows):
 
     def first(self, observer: Any, case: Any) -> tuple[Row, Any]:
         x, d = case["truth"] if case["truth"] is not None else (None, None)
-        noise = estimation.noise_at(case["noise"], 0)
+        noise = scan.noise_at(case["noise"], 0)
         # There is no d[-1]; zeros stand in for it if there is any truth of d at all.
         before = None if d is None else jnp.zeros(d.shape[1:], d.dtype)
-        y = case["y"] if case["length"] is None else estimation.cut(case["y"], case["length"])
+        y = case["y"] if case["length"] is None else scan.cut(case["y"], case["length"])
         return Row(y[0], case["u"][0], noise, None if x is None else x[0], before), None
 
     def given(self, case: Any) -> Any:
         x, d = case["truth"] if case["truth"] is not None else (None, None)
-        y = case["y"] if case["length"] is None else estimation.cut(case["y"], case["length"])
-        noise = jax.tree.map(lambda a: a[1:], estimation.noise_rows(case["noise"]))
+        y = case["y"] if case["length"] is None else scan.cut(case["y"], case["length"])
+        noise = jax.tree.map(lambda a: a[1:], scan.noise_rows(case["noise"]))
         steps = y.shape[0]
         return y[1:], case["u"][1:], noise, None if x is None else x[1:steps], None if d is None else d[: steps - 1]
 
     def following(self, observer: Any, case: Any, carried: Any, k: Any, given: Any) -> tuple[Row, Any]:
         y, u, now, x, d = given
-        return Row(y, u, estimation.noise_of_row(case["noise"], now), x, d), None
+        return Row(y, u, scan.noise_of_row(case["noise"], now), x, d), None

@@ -8,8 +8,9 @@ from typing import Any
 from gsisio_jax._extras import need
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.rounding import Rounding
-from gsisio_jax.observer import estimation
-from gsisio_jax.observer.estimation import AnyObserver, OnConflict
+from gsisio_jax.observer import checks
+from gsisio_jax.observer.checks import AnyObserver
+from gsisio_jax.observer.estimation import OnConflict
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.axes import Axis, Layout, bare, prepare
 from gsisio_jax.study.job import Job, run
@@ -90,9 +91,9 @@ def sweep(
     Source: design 4.4 and 7.
     """
     need("xarray", extra="study", purpose="a sweep")
-    observer = estimation.rounded(CALL, observer, rounding)
+    observer = checks.rounded(CALL, observer, rounding)
     reductions = resolve(CALL, reduce, truth is not None)
-    hold = estimation.check_on_conflict(CALL, on_conflict)
+    hold = checks.check_on_conflict(CALL, on_conflict)
     given = {
         "initial": initial, "y": y, "noise": observer.noise if noise is None else noise, "u": u, "length": length,
         "truth": truth,

@@ -13,9 +13,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from gsisio_jax import scalar
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer import estimation
-from gsisio_jax.observer.estimation import AnyObserver, OnConflict
+from gsisio_jax.observer import checks, scan
+from gsisio_jax.observer.checks import AnyObserver
+from gsisio_jax.observer.estimation import OnConflict
+from gsisio_jax.observer.fixed import chosen, fixed
 from gsisio_jax.plant.system import Noise
 
 SHORT = 512  # steps up to which a record is one chunk
@@ -59,11 +62,11 @@ def fold(
 
     Source: design 4.3.
     """
-    initial, y, u, noise, observer = estimation._prepare("fold", observer, initial, y, u, noise, rows=True)
+    initial, y, u, noise, observer = checks.prepare("fold", observer, initial, y, u, noise, rows=True)
     if length is not None:
-        estimation._check_length(length, y.shape[0])
-        y = estimation.cut(y, length)
-    hold = estimation.check_on_conflict("fold", on_conflict)
+        checks.check_length(length, y.shape[0])
+        y = scan.cut(y, length)
+    hold = checks.check_on_conflict("fold", on_conflict)
     return fold_rows(observer, initial, y, u, noise, update, state, hold=hold, length=length, rows=rows)
 
 
@@ -81,11 +84,9 @@ def fold_rows(
     rows: Any = None,
 ) -> Any:
     """`fold` without its checks: everything in its final type and shape, rows behind `length` already missing."""
-    recursion = estimation.recursion_of(observer)
-    # NumPy constants of an observer that is closed over may meet derivative rules that want arrays of JAX.
-    observer = jax.tree.map(jnp.asarray, observer)
+    observer = chosen(*fixed(observer))
     given = () if rows is None else (rows,)
-    carry, out = recursion.begin(observer, initial, y[0], u[0], estimation.noise_at(noise, 0), hold)
+    carry, out = scan.begin(observer, initial, y[0], u[0], scan.noise_at(noise, 0), hold)
     state = _like(state, update(state, out, jnp.int32(0), *jax.tree.map(lambda a: a[0], given)))
     steps = y.shape[0] - 1
     if not steps:
@@ -93,11 +94,10 @@ def fold_rows(
     last = jnp.int32(y.shape[0]) if length is None else length
 
     # A scan keeps what its body hands on; what the body computes besides is computed again in the backward run.
-    @_forget
     def step(both: Any, row: Any) -> tuple[Any, None]:
         carry, state = both
         k, y_k, u_k, now, given = row
-        carry, out = recursion.advance(observer, carry, y_k, u_k, estimation.noise_of_row(noise, now), hold)
+        carry, out = scan.advance(observer, carry, y_k, u_k, scan.noise_of_row(noise, now), hold)
         after = _like(state, update(state, out, k, *given))
         return (carry, jax.tree.map(lambda a, b: jnp.where(k < last, a, b), after, state)), None
 
@@ -109,15 +109,15 @@ def fold_rows(
         return jnp.concatenate([a[1:], a[-1:].repeat(spare, 0)]).reshape(chunks, size, *a.shape[1:])
 
     k = jnp.arange(y.shape[0] + spare, dtype=jnp.int32)[1:].reshape(chunks, size)
-    rest = jax.tree.map(fit, (y, u, estimation.noise_rows(noise), given))
+    rest = jax.tree.map(fit, (y, u, scan.noise_rows(noise), given))
     rows = (k, *rest)
     if chunks == 1:
-        (_, state), _ = jax.lax.scan(step, (carry, state), jax.tree.map(lambda a: a[0], rows))
+        (_, state), _ = scalar.scan(step, (carry, state), jax.tree.map(lambda a: a[0], rows), wrap=_forget)
         return state
 
     @_forget
     def chunk(both: Any, rows: Any) -> tuple[Any, None]:
-        return jax.lax.scan(step, both, rows)
+        return scalar.scan(step, both, rows, wrap=_forget)
 
     (_, state), _ = jax.lax.scan(chunk, (carry, state), rows)
     return state

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer import estimation
+from gsisio_jax.observer import scan
 from gsisio_jax.observer.types import Observer, cast
 from gsisio_jax.tuning.compiled import quickly
 from gsisio_jax.tuning.fold import fold_rows
@@ -69,7 +69,7 @@ def score_record(observer: Observer, noise: Any, record: dict[str, Any], room: A
     dtype = record["y"].dtype
     zero, none = jnp.zeros((), dtype), jnp.int32(0)
     start = Score(zero, zero + jnp.inf, none, jnp.int32(-1), none, none)
-    y, d = estimation.cut(record["y"], record["length"]), record["d"]
+    y, d = scan.cut(record["y"], record["length"]), record["d"]
     before = jnp.concatenate([jnp.full_like(d[:1], jnp.nan), d[:-1]])  # the step from k-1 to k bounds d[k-1]
     return fold_rows(
         observer, record["initial"], y, record["u"], noise, update, start,

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from gsisio_jax._extras import need
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer import estimation
+from gsisio_jax.observer import checks
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise, System
 from gsisio_jax.tuning.compiled import quickly
@@ -71,7 +71,7 @@ def width_sensitivity(
     if (model is None) != (theta is None):
         raise ValueError("width_sensitivity: `model` and `theta` belong together; give both or none")
     call = "width_sensitivity"
-    initial, y, u, bounds, typed = estimation._prepare(call, observer, initial, y, u, noise, rows=True)
+    initial, y, u, bounds, typed = checks.prepare(call, observer, initial, y, u, noise, rows=True)
     assert isinstance(typed, Observer)
     observer = typed
     if any(len(box.shape) != 1 for box in (bounds.w, bounds.v)):

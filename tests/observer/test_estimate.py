@@ -13,7 +13,7 @@ import systems
 from oracles.numpy_program import numpy_function
 
 import gsisio_jax as gx
-from gsisio_jax.observer.step import advance, begin
+from gsisio_jax.observer.step import advance, blank
 
 STEPS = 25
 NAN = np.nan
@@ -119,7 +119,9 @@ def assert_equal(got: Any, expected: Any, rtol: float = 1e-12):
 def numpy_loop(run: Run, hold: bool = False, noise: Any = None) -> gx.Estimate:
     """The same step in a Python loop over rows, every operation by NumPy."""
     observer, noise = run.observer.astype(np.float64), noise or (lambda k: run.noise)
-    first = numpy_function(partial(begin, observer, hold=hold), run.initial, run.y[0], run.u[0], noise(0))
+    first = numpy_function(
+        partial(advance, observer, hold=hold), blank(observer, run.initial), run.y[0], run.u[0], noise(0)
+    )
     carry, out = first(run.initial, run.y[0], run.u[0], noise(0))
     following = numpy_function(partial(advance, observer, hold=hold), carry, run.y[1], run.u[1], noise(1))
     outputs = [out]

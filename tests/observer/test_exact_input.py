@@ -10,8 +10,8 @@ from oracles.input_hull import feasibility_slack, input_hull
 import gsisio_jax as gx
 from gsisio_jax import Interval
 from gsisio_jax.interval.box import image
-from gsisio_jax.observer.contractors import Evidence, Terms
-from gsisio_jax.observer.step import _exact_input
+from gsisio_jax.observer.domain import Domain
+from gsisio_jax.observer.step import exact_input
 
 
 def plant(input_bounds=None):
@@ -24,16 +24,14 @@ def plant(input_bounds=None):
     return system, gx.Noise(systems.ball([0.05, 0.1, 0.02]), systems.ball([0.1, 0.03, 0.2]))
 
 
-def explained(observer, lower, upper, d=None):
+def explained(observer, lower, upper):
     """The observer's box of d and its conflict for a given box of [G; H] d."""
-    n = observer.system.n
-    evidence = Evidence(Interval.unchecked(lower[:n], upper[:n]), jnp.asarray(1.0))
-    known = Interval.unchecked(jnp.concatenate([jnp.zeros(n), -upper[n:]]), jnp.concatenate([jnp.zeros(n), -lower[n:]]))
-    bounds = image(observer.bounded_inputs, observer.system.input_bounds)
-    nothing = Interval.point(np.zeros(0))
-    terms = Terms(nothing, nothing, nothing, bounds)
-    box, evidence = _exact_input(observer, evidence, known, terms, observer.system.input_bounds)
-    return box, evidence.conflict
+    domain = Domain.of(Interval.entire(observer.system.n), jnp.asarray(1.0))
+    known = image(observer.bounded_inputs, observer.system.input_bounds)
+    box, domain = exact_input(
+        observer, domain, Interval.unchecked(lower, upper), known, observer.system.input_bounds, None, jnp.asarray(True)
+    )
+    return box, domain.conflict
 
 
 @pytest.mark.parametrize("bound", [None, 0.4])

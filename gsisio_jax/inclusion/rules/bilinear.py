@@ -12,13 +12,11 @@ import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import (
     added_slack,
-    moderate,
     product,
     scaled_slack,
     shift,
     stretch,
     sum_slack,
-    times,
 )
 from gsisio_jax.inclusion.node import Node, as_node, best_form, chain, is_node, join, meet, parts, settled, slope_of
 from gsisio_jax.inclusion.rules.functions import CURVES, RECIPROCAL, SQUARE, power
@@ -26,6 +24,7 @@ from gsisio_jax.inclusion.rules.linear import add, move, multiple, structural, t
 from gsisio_jax.inclusion.rules.univariate import apply, extremes
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, is_concrete
+from gsisio_jax.interval.primitives import moderate, times
 
 
 def multiply(x: Any, y: Any) -> Node:

@@ -8,14 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.rules.sincos import LIMIT, SLOT, sin_cos
+from gsisio_jax.inclusion.rules.sincos import LIMIT, SLOT, half_sin_cos, sin_cos
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose
 from gsisio_jax.interval.minmax import larger, smaller
-from gsisio_jax.interval.xla import once
+from gsisio_jax.interval.primitives import fusion_barrier
 
 _PERIOD = 6.28  # a little less than 2 pi
 
@@ -45,7 +46,7 @@ class Wave:
     def parts(self, a: Any, b: Any) -> _WaveParts:
         """What all three need."""
         usable, m, r = _middle(a, b)
-        return _WaveParts(usable, m, r, *sin_cos(m), *sin_cos(0.5 * r))
+        return _WaveParts(usable, m, r, *sin_cos(m), *half_sin_cos(r))
 
     def range(self, a: Any, b: Any, parts: _WaveParts | None = None) -> Interval:
         return _wave_range(self.cosine, 1.0, parts or self.parts(a, b))
@@ -81,7 +82,7 @@ def _middle(a: Any, b: Any) -> tuple[Any, Any, Any]:
     """Is [a, b] within less than a period and near enough for `sin_cos`; middle and half-width, 0 where it is not."""
     m, r = 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
     usable = (r < 0.5 * _PERIOD) & (abs(m) + r < LIMIT[a.dtype.name])  # not where either is infinite or NaN
-    return usable, once(jnp.where(usable, m, 0)), once(jnp.where(usable, r, 0))
+    return usable, fusion_barrier(jnp.where(usable, m, 0)), fusion_barrier(jnp.where(usable, r, 0))
 
 
 def _wave_padded(exact: Interval, cosine: bool, m: Any, r: Any) -> Interval:
@@ -117,3 +118,49 @@ def _wave_range(cosine: bool, sign: float, parts: _WaveParts) -> Interval:
     found = _wave_padded(Interval.unchecked(even - odd, even + odd), cosine, m, r)
     lower, upper = jnp.where(bottom, -1, found.lower), jnp.where(top, 1, found.upper)
     return Interval.unchecked(jnp.maximum(lower, -1), jnp.minimum(upper, 1))
+
+
+def wave_atom(cosine: bool, m: Any, r: Any, size: Any, terms: int) -> tuple[Any, Any, Any, Interval, tuple[Any, Any]]:
+    """Slope, center and radius of the offset, range, and value in the middle, of a sine or cosine of ``|t - m| <= r``,
+    with ``|t| <= size``.
+
+    As `Wave`, from the middle and the half-width alone, but in fewer operations. A crest lies inside where its distance
+    from m is at most r, that is, where ``sin m >= cos r``. Radius and range are padded by what these formulas lose
+    (`_wave_padded`), and by ``3 kappa`` times the size for rows of that many terms (`expansion`): offset and slope
+    times argument are below ``3 size`` in magnitude, or ``1 + 2 size`` for a cosine.
+    """
+    kind = np.dtype(m.dtype).type
+    usable = (r < 0.5 * _PERIOD) & (size < LIMIT[m.dtype.name])  # not where either is infinite or NaN
+    m, r = jnp.where(usable, m, 0), jnp.where(usable, r, 0)
+    (sine, other), (half_sin, half_cos) = sin_cos(m), half_sin_cos(r)
+    value, steepness = (other, -sine) if cosine else (sine, other)
+    pad: Any = kind(0)
+    if rounding.outward():
+        size = jax.lax.stop_gradient(jnp.where(usable, size, 0)) + kind(cosine)
+        pad = rounding.error(size, 8 * SLOT + 3 * (2 * terms + 16), 2.0**60)
+    slope, steep, turned = steepness * half_cos, abs(steepness), 1 - 2 * half_sin * half_sin
+    odd = steep * larger(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
+    even = value * turned
+    center = 0.5 * (value + even) - slope * m
+    radius = 0.5 * abs(value - even) + odd + pad
+    reach = 2 * steep * half_sin * half_cos + pad
+    limit = turned - pad
+    lower = jnp.where(usable & (-value < limit), even - reach, -1)
+    upper = jnp.where(usable & (value < limit), even + reach, 1)
+    natural = Interval.unchecked(larger(lower, -1), smaller(upper, 1))
+    middle = jnp.where(usable, value, 0), jnp.where(usable, pad, 1)
+    slope, center = jnp.where(usable, slope, 0), jnp.where(usable, center, 0)
+    return slope, center, jnp.where(usable, radius, kind(1) + pad), natural, middle
+
+
+def wave_point(cosine: bool, t: Any, size: Any, terms: int) -> tuple[Any, Any]:
+    """A sine or cosine of a sum t of terms of the total magnitude `size`, and by how much it may be off: by what t is,
+    by its own rounding, and for rows of that many terms."""
+    kind = np.dtype(t.dtype).type
+    usable = size < LIMIT[t.dtype.name]
+    value = sin_cos(jnp.where(usable, t, 0))[cosine]
+    pad: Any = kind(0)
+    if rounding.outward():
+        size = jax.lax.stop_gradient(jnp.where(usable, size, 0)) + kind(cosine)
+        pad = rounding.error(size, 8 * SLOT + 3 * (2 * terms + 16), 2.0**60)
+    return value, jnp.where(usable, pad, 2)

@@ -30,14 +30,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.form_arithmetic import guard, scaled_slack, slope_reach, times
+from gsisio_jax.inclusion.form_arithmetic import guard, scaled_slack, slope_reach
 from gsisio_jax.inclusion.node import POINT_MODE, Node, best_form, chain, settled
 from gsisio_jax.inclusion.rules.sincos import LIMIT
 from gsisio_jax.inclusion.rules.trig import Wave, crosses
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, held
 from gsisio_jax.interval.minmax import larger, smaller
-from gsisio_jax.interval.xla import once
+from gsisio_jax.interval.primitives import fusion_barrier, times
 
 INF = math.inf
 # Below this relative width a secant is mostly rounding; the tangent at the middle is as good there.
@@ -59,7 +59,7 @@ def apply(curve: Any, x: Node) -> Node:
     form = None
     if x.form is not None and not POINT_MODE.get():
         s, rest = curve.line(a, b, natural, *shared)
-        s, rest = once(s), held(rest)
+        s, rest = fusion_barrier(s), held(rest)
         slope, offset = s * x.form.slope, x.form.offset
         up = s >= 0
         first, last = (times(s, jnp.where(mask, offset.lower, offset.upper)) for mask in (up, ~up))

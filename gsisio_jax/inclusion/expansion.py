@@ -1,0 +1,555 @@
+"""A function as a linear map of the state and of a few atoms: ``f(x) = L x + A a(x) + c``.
+
+An atom is the result of an operation that is not linear (a sine, a product), or an entry of the known input. Sums and
+multiples between them are collected while tracing, in fractions, so a linear combination of outputs, ``R f(x)``, has
+the constant weights ``R L`` and ``R A``: what cancels cancels exactly, and costs nothing at run time.
+
+On a box every atom has a slope and an offset, ``a - s . x in offset``, and a range. Bounds of a combination are the
+linear part plus those of the atoms, slopes combined before the box is applied (`joint`), or ranges alone (`natural`).
+
+**Rounding.** Let a row have N terms in all (states, atoms, a constant) and T = sum |L_i| m_i + sum |A_j| q_j, where
+``m_i >= |x_i|`` and ``q_j = sum_i |s_ji| m_i + |offset_j|``. Slopes combined, weights rounded once from fractions,
+products and sums are each off by eps of a term of T, N + 4 times at most for each of two levels: in all less than
+``(2 N + 12) eps T``, plus what is flushed to zero. So every offset is made wider by ``kappa q_j`` and every state by
+``kappa m_i``, with ``kappa = (2 N + 16) eps``, ONCE for a box: a row of weights w then takes in
+``sum |w_i| kappa m_i + sum |w_j| kappa q_j = kappa T`` by itself, whatever its weights are, and needs no error term of
+its own. For ranges the same with ``|range_j|`` in the place of q_j. Flushed numbers lose less than ``2^60 tiny``, see
+`rounding.generous`; that is added to every offset and state.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node
+from gsisio_jax.inclusion.rules.bilinear import multiply
+from gsisio_jax.inclusion.rules.functions import CURVES, RECIPROCAL, SQUARE
+from gsisio_jax.inclusion.rules.registry import ELEMENTWISE
+from gsisio_jax.inclusion.rules.trig import Wave, wave_atom, wave_point
+from gsisio_jax.inclusion.rules.univariate import apply
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, choose, nan_to_unbounded
+from gsisio_jax.interval.minmax import cut, raised
+from gsisio_jax.interval.primitives import matmul, scale
+from gsisio_jax.scalar.graph import Graph, Number, is_constant
+from gsisio_jax.scalar.unroll import collected, evaluate
+
+_MOST_OPERATIONS = 400  # of f and g together; beyond, bounds come from the engine over arrays
+FLUSHED = 2.0**60  # in smallest normal numbers
+
+
+class States(eqx.Module):
+    """The box of x as atoms and rows use it: center, radius, `slip` = kappa m, and both sides widened by it.
+
+    Every field has shape (n,); a radius may be infinite, a center never is.
+    """
+
+    center: Any
+    radius: Any
+    magnitude: Any
+    slip: Any
+    wide: Interval
+
+    @classmethod
+    def of(cls, box: Interval, terms: int) -> States:
+        box = Interval.unchecked(jnp.asarray(box.lower), jnp.asarray(box.upper))
+        radius = 0.5 * (box.upper - box.lower)
+        center = jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0)
+        magnitude = abs(center) + radius
+        slip = wider(magnitude, terms)
+        return cls(center, radius + slip, magnitude, slip, Interval.unchecked(box.lower - slip, box.upper + slip))
+
+
+class AtomBounds(eqx.Module):
+    """Bounds of J atoms on a box, widened so that linear images need no more rounding (module docstring).
+
+    Attributes:
+        slope: (J, n).
+        center, radius: (J,) of the offset: ``|a - slope x - center| <= radius``.
+        range: box (J,).
+        value, slip: (J,) the atoms at the center of the box, and what rounding leaves of them; None where not asked for.
+    """
+
+    slope: Any
+    center: Any
+    radius: Any
+    range: Interval
+    value: Any = None
+    slip: Any = None
+
+
+def wider(size: Any, terms: int) -> Any:
+    """kappa times `size`, for rows of up to so many terms; a constant for gradients. 0 to nearest."""
+    if not rounding.outward():
+        return jnp.zeros_like(size)
+    info = jnp.finfo(size.dtype)
+    kind = np.dtype(size.dtype).type
+    kappa, floor = kind((2 * terms + 16) * float(info.eps)), kind(FLUSHED * float(info.tiny))
+    return jax.lax.stop_gradient(size) * kappa + floor
+
+
+class Rows(eqx.Module):
+    """Linear combinations ``states x + atoms a(x) + constant``: weights (r, n), (r, J) and (r,)."""
+
+    states: Any
+    atoms: Any
+    constant: Any
+
+    def joint(self, states: States, atoms: AtomBounds) -> tuple[Any, Any]:
+        """Center and radius (r,), slopes combined before the box is applied."""
+        slope = self.slope(atoms)
+        center = matmul(slope, states.center) + matmul(self.atoms, atoms.center) + self.constant
+        radius = scale(abs(slope), states.radius).sum(-1) + scale(abs(self.atoms), atoms.radius).sum(-1)
+        slip = scale(abs(self.states), states.slip).sum(-1) + wider(jnp.asarray(abs(self.constant)), 0)
+        return center, radius + slip
+
+    def joint_box(self, states: States, atoms: AtomBounds) -> Interval:
+        """The same as a box (r,)."""
+        center, radius = self.joint(states, atoms)
+        return Interval.unchecked(center - radius, center + radius)
+
+    def slope(self, atoms: AtomBounds) -> Any:
+        """(r, n), up to rounding that `AtomBounds` has taken in."""
+        return self.states + matmul(self.atoms, atoms.slope)
+
+    def natural(self, states: States, atoms: AtomBounds) -> Interval:
+        """Box (r,) from ranges alone."""
+        weights = jnp.concatenate([jnp.asarray(self.states), jnp.asarray(self.atoms)], -1)
+        lower = jnp.concatenate([states.wide.lower, atoms.range.lower])
+        upper = jnp.concatenate([states.wide.upper, atoms.range.upper])
+        slip = wider(jnp.asarray(abs(self.constant)), 0)
+        low, high = _sides(weights, lower, upper)
+        return Interval.unchecked(low + (self.constant - slip), high + (self.constant + slip))
+
+    def bounds(self, states: States, atoms: AtomBounds) -> Interval:
+        """The intersection of both, box (r,)."""
+        center, radius = self.joint(states, atoms)
+        natural = self.natural(states, atoms)
+        return Interval.unchecked(raised(natural.lower, center - radius), cut(natural.upper, center + radius))
+
+
+def _sides(weights: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
+    """Both sides of the image of a box that has been widened beforehand."""
+    up = weights >= 0
+    low = scale(weights, jnp.where(up, lower, upper)).sum(-1)
+    return low, scale(weights, jnp.where(up, upper, lower)).sum(-1)
+
+
+@dataclass
+class Linear:
+    """``sum coefficients[k] variable_k + constant``: variables 0..n-1 are states, the others atoms."""
+
+    coefficients: dict[int, Fraction] = field(default_factory=dict)
+    constant: Fraction = Fraction(0)
+
+    def plus(self, other: Linear, sign: int = 1) -> Linear:
+        merged = dict(self.coefficients)
+        for k, value in other.coefficients.items():
+            merged[k] = merged.get(k, Fraction(0)) + sign * value
+        return Linear({k: v for k, v in merged.items() if v}, self.constant + sign * other.constant)
+
+    def times(self, factor: Fraction) -> Linear:
+        if not factor:
+            return Linear()
+        return Linear({k: factor * v for k, v in self.coefficients.items()}, factor * self.constant)
+
+
+@dataclass
+class _Atom:
+    """An operation that is not linear: its primitive and arguments; or the entry `source` of the known input."""
+
+    name: str
+    equation: Any
+    arguments: tuple[Linear, ...]
+    source: int | None = None
+
+
+@dataclass
+class Expansion:
+    """``function(x, u) = L x + A a(x, u) + c``, found while tracing.
+
+    Attributes:
+        n: number of states.
+        atoms: in an order in which each depends on earlier ones only.
+        outputs: one `Linear` for every component of the function.
+    """
+
+    n: int
+    atoms: list[_Atom]
+    outputs: list[Linear]
+
+    @property
+    def terms(self) -> int:
+        """Number of terms that a row can have."""
+        return self.n + len(self.atoms) + 1
+
+    def rows(self, weights: Any, dtype: Any, minus: Any = None) -> Rows:
+        """``weights @ function - minus @ x`` for constant weights (r, outputs), in fractions until the end."""
+        weights = np.asarray(weights, np.float64)
+        minus = np.zeros((len(weights), self.n)) if minus is None else np.asarray(minus, np.float64)
+        states = np.zeros((len(weights), self.n), dtype)
+        atoms = np.zeros((len(weights), len(self.atoms)), dtype)
+        constant = np.zeros(len(weights), dtype)
+        for r, row in enumerate(weights):
+            total = Linear({i: -Fraction(float(v)) for i, v in enumerate(minus[r]) if v})
+            for weight, output in zip(row, self.outputs, strict=True):
+                if weight:
+                    total = total.plus(output.times(Fraction(float(weight))))
+            for k, value in total.coefficients.items():
+                (states if k < self.n else atoms)[r, k - (0 if k < self.n else self.n)] = float(value)
+            constant[r] = float(total.constant)
+        return Rows(states, atoms, constant)
+
+    def bounds(
+        self, states: States, u: Any, wanted: Sequence[bool] | None = None, with_values: bool = False
+    ) -> AtomBounds:
+        """Bounds of the atoms on a box, and on request their values at its center; those that are not `wanted`, by
+        themselves or by others, may be anything."""
+        found: list[_Bounded] = []
+        domain = InputBox(states.wide.lower, states.wide.upper, states.magnitude)
+        memo: dict[int, Any] = {}
+        at: list[Any] = []
+        thin = _thin(states.center, self.terms)
+        for atom, used in zip(self.atoms, self._needed(wanted), strict=True):
+            bounded = self._bounded(atom, states, u, found, domain, memo) if used else _nothing(self.n, states)
+            found.append(bounded)
+            if with_values:
+                known = bounded.value
+                at.append(self._value(atom, states.center, thin, u, at) if known is None else known)
+        return _stacked(found, at, states)
+
+    def values(self, x: Any, u: Any, wanted: Sequence[bool] | None = None) -> tuple[Any, Any]:
+        """The atoms at a point x, and what rounding leaves of them, (J,) each."""
+        found: list[Any] = []
+        thin, zero = _thin(x, self.terms), jnp.zeros_like(x[0])
+        for atom, used in zip(self.atoms, self._needed(wanted), strict=True):
+            found.append(self._value(atom, x, thin, u, found) if used else Interval.unchecked(zero, zero))
+        return _values(found, x.dtype)
+
+    def _value(self, atom: _Atom, x: Any, thin: Interval, u: Any, found: Sequence[Any]) -> Any:
+        """An atom at a point, as (value, radius), or on a thin box around it, as a box; widened for rows."""
+        curve = CURVES.get(atom.name)
+        if isinstance(curve, Wave) and self._plain(atom):
+            return wave_point(curve.cosine, *self._at(atom.arguments[0], x, abs(x)), self.terms)
+        found = [v if isinstance(v, Interval) else Interval.unchecked(v[0] - v[1], v[0] + v[1]) for v in found]
+        if atom.source is not None:
+            value = Interval.unchecked(u[atom.source], u[atom.source])
+        else:
+            token = POINT_MODE.set(True)
+            try:
+                nodes = [
+                    Node(self._argument_range(t, thin, found)) if t.coefficients else _number(t, thin.lower.dtype)
+                    for t in atom.arguments
+                ]
+                value = nan_to_unbounded(_rule(atom, nodes).range)
+            finally:
+                POINT_MODE.reset(token)
+        extra = wider(jnp.maximum(abs(value.lower), abs(value.upper)), self.terms)
+        return Interval.unchecked(value.lower - extra, value.upper + extra)
+
+    def _plain(self, atom: _Atom) -> bool:
+        """Its argument is a linear function of the states."""
+        return all(k < self.n for k in atom.arguments[0].coefficients)
+
+    def used_by(self, *rows: Rows) -> list[bool]:
+        """Which atoms have a weight in some row."""
+        return [any(bool(np.any(row.atoms[:, j])) for row in rows) for j in range(len(self.atoms))]
+
+    def _needed(self, wanted: Sequence[bool] | None) -> list[bool]:
+        needed = [True] * len(self.atoms) if wanted is None else list(wanted)
+        for j in range(len(self.atoms))[::-1]:
+            if needed[j]:
+                for argument in self.atoms[j].arguments:
+                    for k in argument.coefficients:
+                        if k >= self.n:
+                            needed[k - self.n] = True
+        return needed
+
+    def _argument_range(self, t: Linear, wide: Interval, found: Sequence[Any]) -> Interval:
+        """Range of an argument from ranges that were widened before."""
+        dtype = wide.lower.dtype
+        kind = np.dtype(dtype).type
+        constant, slip = kind(t.constant), abs(kind(t.constant)) * kind(16 * float(jnp.finfo(dtype).eps))
+        slip = slip if rounding.outward() else kind(0)
+        lower, upper = constant - slip, constant + slip
+        for k, value in t.coefficients.items():
+            weight = kind(value)
+            side = wide[k] if k < self.n else found[k - self.n]
+            first, last = (side.lower, side.upper) if value > 0 else (side.upper, side.lower)
+            lower, upper = lower + weight * first, upper + weight * last
+        return Interval.unchecked(*(jnp.asarray(side, dtype) for side in (lower, upper)))
+
+    def _bounded(
+        self, atom: _Atom, states: States, u: Any, found: list[_Bounded], domain: InputBox, memo: dict[int, Any]
+    ) -> _Bounded:
+        if atom.source is not None:
+            point = Interval.unchecked(u[atom.source], u[atom.source])
+            slip = wider(abs(u[atom.source]), self.terms)
+            zero = np.zeros(self.n, states.center.dtype)
+            return _Bounded(zero, point.lower, slip, Interval.unchecked(point.lower - slip, point.upper + slip))
+        curve = CURVES.get(atom.name)
+        if isinstance(curve, Wave) and self._plain(atom):
+            return self._wave(curve, atom.arguments[0], states)
+        nodes = []
+        for t in atom.arguments:
+            if not t.coefficients:
+                nodes.append(_number(t, states.center.dtype))
+                continue
+            if id(t) not in memo:
+                memo[id(t)] = self._argument(t, states, found, domain)
+            nodes.append(memo[id(t)])
+        return _from_node(_rule(atom, nodes), states, self.terms)
+
+    def _wave(self, curve: Wave, t: Linear, states: States) -> _Bounded:
+        """Sine or cosine of a linear function of the states."""
+        dtype = states.center.dtype
+        kind = np.dtype(dtype).type
+        m, size = self._at(t, states.center, states.magnitude)
+        r: Any = kind(0)
+        for k, weight in t.coefficients.items():
+            r = r + kind(abs(float(weight))) * states.radius[k]
+        steepness, center, radius, natural, middle = wave_atom(curve.cosine, m, r, size, self.terms)
+        slope: list[Any] = [np.zeros((), dtype)] * self.n
+        for k, weight in t.coefficients.items():
+            slope[k] = steepness * kind(weight)
+        return _Bounded(jnp.stack(slope), center, radius, natural, middle)
+
+    def _at(self, t: Linear, x: Any, magnitude: Any) -> tuple[Any, Any]:
+        """A linear function of the states at a point, and the magnitude of its terms."""
+        kind = np.dtype(x.dtype).type
+        value: Any = kind(float(t.constant))
+        size: Any = kind(abs(float(t.constant)))
+        for k, weight in t.coefficients.items():
+            value = value + kind(float(weight)) * x[k]
+            size = size + kind(abs(float(weight))) * magnitude[k]
+        return jnp.asarray(value), jnp.asarray(size)
+
+    def _argument(self, t: Linear, states: States, found: list[_Bounded], domain: InputBox) -> Node:
+        """A linear argument as a node: a range met with what slopes say, and its form."""
+        dtype = states.center.dtype
+        kind = np.dtype(dtype).type
+        natural = self._argument_range(t, states.wide, [bounded.range for bounded in found])
+        inner = {k - self.n: v for k, v in t.coefficients.items() if k >= self.n}
+        slope = np.zeros(self.n, dtype)
+        slip: Any = kind(0)
+        for k, value in t.coefficients.items():
+            if k < self.n:
+                slope[k] = kind(value)
+                inexact = value != Fraction(float(slope[k])) or len(t.coefficients) > 1 or inner
+                slip = slip + kind(abs(float(value))) * states.slip[k] if inexact and rounding.outward() else slip
+        center: Any = kind(t.constant)
+        radius: Any = slip + abs(center) * kind(16 * float(jnp.finfo(dtype).eps) * rounding.outward())
+        moving: Any = slope
+        for j, value in inner.items():
+            weight = kind(value)
+            moving = moving + weight * found[j].slope
+            center, radius = center + weight * found[j].center, radius + abs(weight) * found[j].radius
+        if not inner:
+            offset = Interval.unchecked(jnp.asarray(center - radius), jnp.asarray(center + radius))
+            return Node(natural, Form(slope, offset, domain))
+        middle = matmul(moving, states.center) + center
+        spread = scale(abs(moving), states.radius).sum() + radius
+        ranges = Interval.unchecked(raised(natural.lower, middle - spread), cut(natural.upper, middle + spread))
+        met = choose(ranges.lower <= ranges.upper, ranges, natural)
+        offset = nan_to_unbounded(Interval.unchecked(center - radius, center + radius))
+        return Node(nan_to_unbounded(met), Form(moving, offset, domain))
+
+
+@dataclass
+class _Bounded:
+    slope: Any
+    center: Any
+    radius: Any
+    range: Interval
+    value: Any = None
+
+
+def _thin(x: Any, terms: int) -> Interval:
+    """A point, widened for rows."""
+    slip = wider(abs(x), terms)
+    return Interval.unchecked(x - slip, x + slip)
+
+
+def _values(found: list[Any], dtype: Any) -> tuple[Any, Any]:
+    """Middles and half-widths, of thin boxes or as they are; where one is infinite, its middle is 0."""
+    if not found:
+        return jnp.zeros(0, dtype), jnp.zeros(0, dtype)
+    pairs = []
+    for v in found:
+        if isinstance(v, Interval):
+            slip = 0.5 * (v.upper - v.lower)
+            v = jnp.where(slip < jnp.inf, 0.5 * (v.lower + v.upper), 0), slip
+        pairs.append(v)
+    value, slip = (jnp.stack([jnp.asarray(pair[i], dtype) for pair in pairs]) for i in (0, 1))
+    return value, slip
+
+
+def _nothing(n: int, states: States) -> _Bounded:
+    zero = np.zeros((), states.center.dtype)
+    return _Bounded(np.zeros(n, zero.dtype), zero, zero, Interval.unchecked(zero, zero))
+
+
+def _stacked(found: list[_Bounded], at: list[Any], states: States) -> AtomBounds:
+    n, dtype = len(states.center), states.center.dtype
+    value, slip = _values(at, dtype) if len(at) == len(found) else (None, None)
+    if not found:
+        none = jnp.zeros(0, dtype)
+        return AtomBounds(jnp.zeros((0, n), dtype), none, none, Interval.unchecked(none, none), value, slip)
+
+    def joined(parts: list[Any]) -> Any:
+        return jnp.stack([jnp.asarray(part, dtype) for part in parts])
+
+    natural = Interval.unchecked(joined([b.range.lower for b in found]), joined([b.range.upper for b in found]))
+    slope, center, radius = ([getattr(b, name) for b in found] for name in ("slope", "center", "radius"))
+    return AtomBounds(joined(slope), joined(center), joined(radius), natural, value, slip)
+
+
+def widened(slope: Any, offset: Interval, natural: Interval, states: States, terms: int) -> AtomBounds:
+    """Bounds of any functions as atoms: affine forms (J, n), (J,) and ranges, each valid by itself."""
+    center, radius = offset.center, offset.radius
+    size = scale(abs(slope), states.magnitude).sum(-1) + abs(center) + radius
+    far = jnp.maximum(abs(natural.lower), abs(natural.upper))
+    slip = wider(jnp.where(jnp.isfinite(far), far, 0), terms)
+    # The radius of an interval is itself rounded.
+    radius = radius + wider(jnp.where(jnp.isfinite(size), size, 0), terms)
+    radius = jnp.where(jnp.isfinite(size), radius, jnp.inf)
+    return AtomBounds(slope, center, radius, Interval.unchecked(natural.lower - slip, natural.upper + slip))
+
+
+def _from_node(node: Node, states: States, terms: int) -> _Bounded:
+    natural = nan_to_unbounded(node.range)
+    if node.form is None:
+        slope: Any = np.zeros(len(states.center), states.center.dtype)
+        offset = natural
+    else:
+        slope, offset = node.form.slope, nan_to_unbounded(node.form.folded())
+    found = widened(slope, offset, natural, states, terms)
+    return _Bounded(found.slope, found.center, found.radius, found.range)
+
+
+def _number(t: Linear, dtype: Any) -> Any:
+    return np.asarray(float(t.constant), dtype)
+
+
+def _rule(atom: _Atom, nodes: list[Any]) -> Node:
+    if atom.name == "reciprocal":
+        return apply(RECIPROCAL, nodes[0])
+    if atom.name == "mul":
+        return apply(SQUARE, nodes[0]) if atom.arguments[0] is atom.arguments[1] else multiply(*nodes)
+    return ELEMENTWISE[atom.name](atom.equation, *nodes)
+
+
+def expand(function: Callable[..., Any], n: int, m: int, dtype: Any) -> Expansion | None:
+    """The expansion of ``function(x, u)``, x (n,) and u (m,); None where it is too large, or holds operations (loops,
+    comparisons, library calls) that the engine over arrays knows better."""
+    closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype))
+    if _size(closed.jaxpr) > 4 * _MOST_OPERATIONS or len(closed.out_avals) != 1:
+        return None
+    graph = Graph()
+    inputs = [collected([graph.input(dtype) for _ in range(size)], (size,)) for size in (n, m)]
+    if any(isinstance(const, jax.core.Tracer) for const in closed.consts):
+        return None
+    (out,) = evaluate(graph, closed.jaxpr, closed.consts, inputs)
+    return _Reader(n, inputs, dtype).expansion(out)
+
+
+def _size(jaxpr: Any) -> int:
+    """Entries of everything that a jaxpr computes, loops unrolled."""
+    total = 0
+    for eqn in jaxpr.eqns:
+        inner = [v for v in eqn.params.values() if hasattr(v, "jaxpr") or hasattr(v, "eqns")]
+        turns = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
+        if inner:
+            total += sum(turns * _size(getattr(v, "jaxpr", v)) for v in inner)
+        else:
+            total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
+    return total
+
+
+_LINEAR = {"add", "sub", "neg", "copy", "stop_gradient", "convert_element_type"}
+_KNOWN = {"mul", "div", "integer_pow", "square", "pow", "atan2", "max", "min", "abs", *CURVES}
+
+
+class _Reader:
+    """Reads numbers into linear combinations of atoms."""
+
+    def __init__(self, n: int, inputs: list[np.ndarray], dtype: Any):
+        self.n, self.atoms, self.dtype = n, [], np.dtype(dtype)
+        self.read: dict[int, Linear] = {id(x): Linear({i: Fraction(1)}) for i, x in enumerate(inputs[0])}
+        for j, u in enumerate(inputs[1]):
+            self.read[id(u)] = self._atom(_Atom("input", None, (), j))
+
+    def expansion(self, outputs: np.ndarray) -> Expansion | None:
+        found = []
+        for value in outputs:
+            linear = self.linear(value)
+            if linear is None:
+                return None
+            found.append(linear)
+        return Expansion(self.n, self.atoms, found) if len(self.atoms) <= _MOST_OPERATIONS else None
+
+    def _atom(self, atom: _Atom) -> Linear:
+        self.atoms.append(atom)
+        return Linear({self.n + len(self.atoms) - 1: Fraction(1)})
+
+    def linear(self, value: Any) -> Linear | None:
+        """A number as a linear combination; None where some operation behind it is not known here."""
+        if is_constant(value):
+            number = float(value)
+            return Linear({}, Fraction(number)) if math.isfinite(number) and value.dtype != bool else None
+        stack = [value]
+        while stack:
+            number = stack[-1]
+            waiting = [v for v in number.operands if isinstance(v, Number) and id(v) not in self.read]
+            if id(number) in self.read:
+                stack.pop()
+            elif waiting:
+                stack += waiting
+            else:
+                found = self._one(number)
+                if found is None:
+                    return None
+                self.read[id(number)] = found
+        return self.read[id(value)]
+
+    def _one(self, number: Number) -> Linear | None:
+        name = number.name
+        if number.dtype != self.dtype or name not in _LINEAR | _KNOWN:
+            return None
+        operands: list[Linear] = []
+        for v in number.operands:
+            linear = self.read[id(v)] if isinstance(v, Number) else self.linear(v)
+            if linear is None:
+                return None
+            operands.append(linear)
+        if name in ("add", "sub"):
+            return operands[0].plus(operands[1], 1 if name == "add" else -1)
+        if name == "neg":
+            return operands[0].times(Fraction(-1))
+        if name in _LINEAR:
+            return operands[0]
+        constant = [v.constant if not v.coefficients else None for v in operands]
+        if name == "mul" and any(c is not None for c in constant):
+            k = 0 if constant[0] is not None else 1
+            return operands[1 - k].times(constant[k])
+        if name == "div" and constant[1] is not None:
+            return operands[0].times(1 / constant[1]) if constant[1] else None
+        if name == "div":
+            inverse = self._atom(_Atom("reciprocal", None, (operands[1],)))
+            return (
+                inverse.times(constant[0])
+                if constant[0] is not None
+                else self._atom(_Atom("mul", None, (operands[0], inverse)))
+            )
+        if name == "pow" and constant[1] is None:
+            return None
+        return self._atom(_Atom(name, number.equation, tuple(operands)))

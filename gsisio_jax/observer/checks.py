@@ -1,0 +1,108 @@
+"""What every call checks before it runs, and the one floating type that everything is brought to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.interval.box import Interval, add, is_concrete
+from gsisio_jax.interval.rounding import Rounding, check_rounding
+from gsisio_jax.observer.prediction_step import PredictionObserver
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.plant.system import Noise
+
+AnyObserver = Observer | PredictionObserver
+
+
+def check_on_conflict(call: str, on_conflict: str) -> bool:
+    """True for "hold"; refuses anything but "restart" and "hold"."""
+    if on_conflict not in ("restart", "hold"):
+        raise ValueError(f'{call}: `on_conflict` must be "restart" or "hold", got {on_conflict!r}')
+    return on_conflict == "hold"
+
+
+def rounded(call: str, observer: AnyObserver, rounding: Rounding | None) -> AnyObserver:
+    """The observer with the rounding that a call asks for."""
+    if rounding is None:
+        return observer
+    check_rounding(call, rounding)
+    return observer if observer.rounding == rounding else observer.with_rounding(rounding)
+
+
+def check_length(length: Any, rows: int) -> None:
+    if np.ndim(length) or not jnp.issubdtype(jnp.result_type(length), jnp.integer):
+        raise ValueError(f"estimate: `length` must be one integer per record, got {length!r}; for many use jax.vmap")
+    if is_concrete(length) and not 0 <= int(length) <= rows:
+        raise ValueError(f"estimate: `length` must be between 0 and the {rows} rows of `y`, got {int(length)}")
+
+
+def prepare(
+    call: str,
+    observer: AnyObserver,
+    initial: Interval,
+    y: Any,
+    u: Any,
+    noise: Noise | None,
+    rows: bool,
+    rounding: Rounding | None = None,
+) -> tuple[Interval, Any, Any, Noise, AnyObserver]:
+    """Check shapes (and values of concrete arrays), and bring everything to one dtype, bounds rounded outward."""
+    observer = rounded(call, observer, rounding)
+    system = observer.system
+    lead = "(T, " if rows else "("
+    if not (isinstance(y, jax.Array | np.ndarray) and jnp.issubdtype(y.dtype, jnp.floating)):
+        y = np.asarray(y, dtype=np.float64) if not isinstance(y, jax.Array) else y.astype(float)
+    if not isinstance(initial, Interval) or initial.shape != (system.n,):
+        raise ValueError(
+            f"{call}: `initial` must be an Interval of shape ({system.n},), got {getattr(initial, 'shape', initial)}; "
+            "for many boxes use jax.vmap"
+        )
+    if y.ndim != 1 + rows or y.shape[-1] != system.l or (rows and y.shape[0] == 0 and call == "estimate"):
+        raise ValueError(
+            f"{call}: measurements must have shape {lead}{system.l}) with T >= 1, got {y.shape}; for many records use "
+            "jax.vmap"
+        )
+    if is_concrete(y) and np.isinf(np.asarray(y)).any():
+        raise ValueError(f"{call}: a measurement is infinite; mark missing entries with NaN")
+    # Arrays of 64 bits may come where JAX has 32 by now: each type first by itself, which is silent.
+    dtype = jnp.result_type(*map(jax.dtypes.canonicalize_dtype, (initial.dtype, y.dtype)))
+    if not jnp.issubdtype(dtype, jnp.floating):
+        dtype = jnp.result_type(float)
+    dtype = jax.dtypes.canonicalize_dtype(dtype)
+    if u is None:
+        if system.m > 0:
+            raise ValueError(f"{call}: the system has {system.m} known inputs; give `u` of shape {lead}{system.m})")
+        u = np.zeros((*y.shape[:-1], 0))
+    if np.shape(u) != (*y.shape[:-1], system.m):
+        raise ValueError(
+            f"{call}: `u` must have shape {(*y.shape[:-1], system.m)}, one row per measurement, got {np.shape(u)}"
+        )
+    if is_concrete(u) and not np.isfinite(np.asarray(u)).all():
+        raise ValueError(f"{call}: `u` must be finite in every row; a known input cannot be missing")
+    noise = observer.noise if noise is None else noise
+    for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
+        legal = [(size,), (y.shape[0], size)] if rows else [(size,)]
+        if box.shape not in legal:
+            raise ValueError(
+                f"{call}: the noise bounds of `{name}` must have shape {' or '.join(map(str, legal))}, got {box.shape}"
+            )
+    if dtype != np.float64:
+        observer = observer.astype(dtype)
+    initial, noise = initial.astype(dtype), noise.astype(dtype)
+    return initial, jnp.asarray(y, dtype), jnp.asarray(u, dtype), _with_lost(y, noise, dtype), observer
+
+
+def _with_lost(y: Any, noise: Noise, dtype: Any) -> Noise:
+    """What a measurement loses when it is rounded to a narrower type belongs to its noise."""
+    if not isinstance(y, np.ndarray) or y.dtype == dtype:
+        return noise
+    narrow = y.astype(dtype)
+    with np.errstate(invalid="ignore"):
+        lost = np.where(np.isnan(y), 0, np.abs(y - narrow.astype(y.dtype)))
+    if not lost.any():
+        return noise
+    radius = Interval(-lost, lost).astype(dtype)
+    return Noise.unchecked(noise.w, add(noise.v, radius))

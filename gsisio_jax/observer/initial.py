@@ -1,0 +1,84 @@
+"""How a step begins: with what is known offline of the outputs on the state bounds, where no box of x[k] is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gsisio_jax.inclusion.expansion import wider
+from gsisio_jax.inclusion.transforms import affine_with_slack
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import (
+    Interval,
+    choose,
+    entire_like,
+    image,
+    plain_image,
+    reach,
+    slip,
+    spread,
+    widened,
+)
+from gsisio_jax.observer.contractors import Affine, centred_form
+from gsisio_jax.observer.domain import Domain
+from gsisio_jax.observer.maps import Maps, at_point
+from gsisio_jax.observer.measurement import in_box
+from gsisio_jax.observer.status import Source
+from gsisio_jax.observer.types import Observer
+
+
+def first_form(observer: Observer, box: Interval, u: Any) -> Affine:
+    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes. For x in `box`."""
+    known, slack = observer.first.form, observer.first.slack
+    if known is None:
+        function = affine_with_slack(lambda x, u: observer.T2 @ observer.system.measurement(x, u))
+        known, slack = function(observer.system.state_bounds, u)
+    center, radius = known.offset.center, known.offset.radius
+    if rounding.outward():
+        radius = radius + wider(abs(center) + jnp.where(jnp.isfinite(radius), radius, 0), 0) + slip(slack, reach(box))
+    return Affine(known.slope, center, radius)
+
+
+def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: Any) -> Domain:
+    """Bounds that need no box to begin with, for x[k] is unknown still, and with it what the gains leave of it: the
+    contraction |N_z| R < 1 on the state bounds, and the linear form of T2 g there.
+
+    Args:
+        maps: of the observer.
+        domain: what is known of x[k] so far.
+        right: right sides of (*) without psi, (K, n).
+        inputs: (p,) bound of ``|d[k-1]|`` but for its part in x[k], which is in the residuals of `first`.
+        u: known input now.
+    """
+    observer = maps.observer
+    first, gains = observer.first, observer.gains
+    if rounding.outward():
+        lost = slip(observer.rounding_constants.gains.d, inputs)
+        right = Interval.unchecked(right.lower - lost, right.upper + lost)
+    for i, k in enumerate(first.gains):
+        if k in first.linear:
+            continue  # the linear form says as much, and costs no value of g
+        left = first.cancellation_residual[k] if rounding.outward() else None
+
+        def psi(x: Any) -> tuple[Any, Any]:
+            return at_point(maps.remainder, x, wider(abs(x), maps.terms), *maps.free_at(x, u))
+
+        bounds = observer.system.state_bounds
+        box = centred_form(
+            right[k], gains.remainder[k], first.inverses[i], psi, right[k].center, bounds, maps.terms, left
+        )
+        box = choose(in_box(u, observer.u_region), box, entire_like(box))
+        domain = domain.intersect(box[None], Source.STATE)
+    if first.linear and first.form is not None:
+        chosen, N_z = jax.tree.map(lambda x: jnp.stack([x[k] for k in first.linear]), (right, gains.remainder))
+        offset = image(-N_z, first.form.offset)
+        shifted = Interval.unchecked(chosen.lower + offset.lower, chosen.upper + offset.upper)
+        boxes = plain_image(first.maps, widened(shifted, first.maps.shape[-1]))
+        if rounding.outward():
+            far = jnp.minimum(spread(first.bounds, reach(boxes)), reach(domain.box))
+            left = slip(first.left, far)
+            boxes = Interval.unchecked(boxes.lower - left, boxes.upper + left)
+        domain = domain.intersect(boxes, Source.STATE)
+    return domain

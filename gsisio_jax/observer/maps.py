@@ -1,0 +1,122 @@
+"""How a step bounds f and g: as rows over a few atoms where they are small, as affine forms over arrays elsewhere.
+
+Both give `AtomBounds` of a box, and `Rows` for linear combinations of f and g over them; the step does not know which
+of the two it has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.inclusion.expansion import AtomBounds, Expansion, Rows, States, expand, widened, wider
+from gsisio_jax.inclusion.intersection import DEFAULT, bound
+from gsisio_jax.interval.box import Interval, reach
+from gsisio_jax.interval.primitives import matmul, scale
+from gsisio_jax.observer.measurement import value_at
+from gsisio_jax.observer.types import Observer
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Bounds of [f; g] and of the unknown-input-free outputs T2 g, for one observer while a step is traced.
+
+    Attributes:
+        observer: with concrete gains, or traced ones.
+        dtype: of the data.
+        expansion: None where f and g are bounded over arrays: traced gains, other methods than the default, large maps.
+    """
+
+    observer: Observer
+    dtype: Any
+    expansion: Expansion | None
+
+    @classmethod
+    def of(cls, observer: Observer, dtype: Any) -> Maps:
+        system = observer.system
+        weights = (observer.gains.residual, observer.inverses.residual, observer.exact.rows, observer.T2, observer.C)
+        small = observer.bounds == DEFAULT and all(isinstance(w, np.ndarray) for w in weights)
+        found = expand(system.maps, system.n, system.m, dtype) if small else None
+        return cls(observer, dtype, found)
+
+    @property
+    def terms(self) -> int:
+        """Number of terms that a row can have, for rounding."""
+        system = self.observer.system
+        atoms = system.n + system.l if self.expansion is None else len(self.expansion.atoms)
+        return system.n + atoms + self.observer.T2.shape[0] + 4
+
+    def states(self, box: Interval) -> States:
+        return States.of(box, self.terms)
+
+    def bounds(self, states: States, box: Interval, u: Any) -> AtomBounds:
+        """Atoms of [f; g] on a box, with their values at its center where the certificate asks for them."""
+        observer, promised = self.observer, self.observer.certificate.promised
+        if self.expansion is not None:
+            return self.expansion.bounds(states, u, with_values=promised)
+        form = bound(observer.system.maps, observer.bounds, observer.abstraction)(box, u)
+        found = widened(form.slope, form.offset, form.range, states, self.terms)
+        value, slip = self._at(observer.system.maps, states.center, u) if promised else (None, None)
+        return replace(found, value=value, slip=slip)
+
+    def free_bounds(self, states: States, box: Interval, u: Any) -> AtomBounds:
+        """Atoms of T2 g on a box."""
+        if self.expansion is not None:
+            return self.expansion.bounds(states, u, self.expansion.used_by(self.free))
+        observer = self.observer
+        form = bound(self._free_map, observer.bounds, observer.output_abstraction)(box, u)
+        return widened(form.slope, form.offset, form.range, states, self.terms)
+
+    def free_at(self, x: Any, u: Any) -> tuple[Any, Any]:
+        """Atoms of T2 g at a point, and what rounding leaves of them."""
+        if self.expansion is not None:
+            return self.expansion.values(x, u, self.expansion.used_by(self.free))
+        return self._at(self._free_map, x, u)
+
+    def _at(self, function: Any, x: Any, u: Any) -> tuple[Any, Any]:
+        value = value_at(function, x, u)
+        extra = wider(reach(value), self.terms)
+        return value.center, value.radius + extra
+
+    def rows(self, weights: Any) -> Rows:
+        """``weights @ [f; g]`` for weights (r, n + l), over `bounds`."""
+        if self.expansion is not None:
+            return self.expansion.rows(weights, self.dtype)
+        return self._over_arrays(weights, None)
+
+    @cached_property
+    def free(self) -> Rows:
+        """T2 g, over `free_bounds`."""
+        return self._free_rows(None)
+
+    @cached_property
+    def remainder(self) -> Rows:
+        """psi = T2 g - C x, over `free_bounds`."""
+        return self._free_rows(self.observer.C)
+
+    def _free_rows(self, minus: Any) -> Rows:
+        T2, n = self.observer.T2, self.observer.system.n
+        if self.expansion is not None:
+            weights = np.concatenate([np.zeros((len(T2), n)), T2], axis=1)
+            return self.expansion.rows(weights, self.dtype, minus)
+        return self._over_arrays(jnp.eye(T2.shape[0], dtype=self.dtype), minus)
+
+    def _over_arrays(self, weights: Any, minus: Any) -> Rows:
+        states = jnp.zeros((weights.shape[0], self.observer.system.n), self.dtype) if minus is None else -minus
+        return Rows(
+            jnp.asarray(states, self.dtype), jnp.asarray(weights, self.dtype), jnp.zeros(len(weights), self.dtype)
+        )
+
+    def _free_map(self, x: Any, u: Any) -> Any:
+        return self.observer.T2 @ self.observer.system.measurement(x, u)
+
+
+def at_point(rows: Rows, x: Any, slip: Any, value: Any, value_slip: Any) -> tuple[Any, Any]:
+    """Center and radius (r,) of a linear combination at a point x, from values of the atoms there."""
+    center = matmul(rows.states, x) + matmul(rows.atoms, value) + rows.constant
+    radius = matmul(abs(rows.states), slip) + scale(abs(rows.atoms), value_slip).sum(-1)
+    return center, radius + wider(jnp.asarray(abs(rows.constant), center.dtype), 0)

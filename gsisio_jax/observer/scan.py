@@ -1,0 +1,71 @@
+"""The recursion over the rows of a record: one compiled scan over `advance`, of either form."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from gsisio_jax import scalar
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer import prediction_step
+from gsisio_jax.observer import step as current_step
+from gsisio_jax.observer.checks import AnyObserver
+from gsisio_jax.observer.prediction_step import PredictionObserver
+from gsisio_jax.observer.types import Carry, StepOutput
+from gsisio_jax.plant.system import Noise
+
+
+def scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
+    """All rows of a record from a carry: the last carry, and what every step returned."""
+
+    def body(carry: Carry, row: Any) -> tuple[Carry, StepOutput]:
+        y_k, u_k, now = row
+        return advance(observer, carry, y_k, u_k, noise_of_row(noise, now), hold)
+
+    return scalar.scan(body, carry, (y, u, noise_rows(noise)), length=y.shape[0])
+
+
+def blank(observer: AnyObserver, initial: Interval) -> Carry:
+    """What comes before the first step: the initial box of x[0] and no measurement."""
+    return _module(observer).blank(observer, initial)
+
+
+def advance(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
+    """One step of the recursion that belongs to this kind of observer."""
+    return _module(observer).advance(observer, carry, y, u, noise, hold)
+
+
+def begin(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    """The first step, as a program of its own: smaller, as its past is known to say nothing."""
+    return scalar.call(
+        lambda initial, y, u, noise: advance(observer, blank(observer, initial), y, u, noise, hold),
+        initial,
+        y,
+        u,
+        noise,
+    )
+
+
+def _module(observer: AnyObserver) -> Any:
+    return prediction_step if isinstance(observer, PredictionObserver) else current_step
+
+
+def noise_at(noise: Noise, k: int) -> Noise:
+    """Bounds of step k, where they change with time."""
+    return Noise.unchecked(*(box[k] if len(box.shape) == 2 else box for box in (noise.w, noise.v)))
+
+
+def noise_rows(noise: Noise) -> Noise:
+    """Bounds that change with time travel with the rows of a scan; constant ones (None here) stay outside the loop."""
+    return Noise.unchecked(*(box if len(box.shape) == 2 else None for box in (noise.w, noise.v)))
+
+
+def noise_of_row(noise: Noise, row: Noise) -> Noise:
+    """Bounds of one step from a row of `noise_rows` and the constant ones."""
+    return Noise.unchecked(noise.w if row.w is None else row.w, noise.v if row.v is None else row.v)
+
+
+def cut(y: Any, length: Any) -> Any:
+    """A ragged record: rows behind `length` are missing."""
+    return jnp.where((jnp.arange(y.shape[0]) < length)[:, None], y, jnp.nan)

@@ -1,0 +1,136 @@
+"""A scalar program: the numbers that its results need, in order, and how to trace them."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from gsisio_jax.interval import minmax, primitives
+from gsisio_jax.interval.primitives import fusion_barrier
+from gsisio_jax.scalar.graph import Graph, Number, is_constant
+from gsisio_jax.scalar.options import repeated
+from gsisio_jax.scalar.unroll import collected, constants, evaluate
+
+# XLA counts these as expensive, and repeats none of them; nor what stays an operation on arrays.
+_ONCE = {
+    "div", "sqrt", "rsqrt", "exp", "log", "log1p", "expm1", "pow", "tan", "tanh", "sin", "cos", "atan2", "cbrt", "erf",
+    "logistic", "array", "part",
+}  # fmt: skip
+_FREE = ("part", "stop_gradient", "wave", "falling_wave")  # of these nothing is left in the compiled program
+# Simplification makes numbers that stand in no equation: those have no parameters.
+_PLAIN = {
+    "add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div, "neg": lax.neg, "abs": lax.abs, "max": lax.max,
+    "min": lax.min, "eq": lax.eq, "select_n": lax.select_n, "and": lax.bitwise_and, "or": lax.bitwise_or,
+    "not": lax.bitwise_not, "stop_gradient": lax.stop_gradient,
+    "scale": primitives.scale.primitive.bind, "times": primitives.times.primitive.bind,
+    "smaller": minmax.smaller.primitive.bind, "larger": minmax.larger.primitive.bind,
+    "raised": minmax.raised.primitive.bind, "cut": minmax.cut.primitive.bind,
+}  # fmt: skip
+
+
+class ScalarProgram:
+    """A function of single numbers.
+
+    Attributes:
+        operations: the numbers that the results need, in order.
+        results: shapes and types of the arrays that the function over arrays returned.
+    """
+
+    def __init__(self, inputs: list[np.ndarray], outputs: list[np.ndarray], dtypes: Sequence[Any]):
+        self._inputs = [value for array in inputs for value in array.ravel()]
+        self._outputs = [value for array in outputs for value in array.ravel()]
+        self.results = [jax.ShapeDtypeStruct(a.shape, dtype) for a, dtype in zip(outputs, dtypes, strict=True)]
+        self._dtypes = [dtype for array, dtype in zip(outputs, dtypes, strict=True) for _ in range(array.size)]
+        self.operations = _needed(self._outputs)
+
+    def __call__(self, args: Sequence[Any]) -> list[Any]:
+        """Trace on 0-d values: entries of all results from entries of all arguments, array by array."""
+        values: dict[int, Any] = {id(number): arg for number, arg in zip(self._inputs, args, strict=True)}
+
+        def read(value: Any) -> Any:
+            return values[id(value)] if isinstance(value, Number) else value
+
+        fenced = self._fenced()
+        for number in self.operations:
+            operands = [read(value) for value in number.operands]
+            if number.name == "part":
+                values[id(number)] = operands[0][number.equation]
+            elif number.name == "array":
+                values[id(number)] = number.equation(operands)
+            else:
+                value = _bind(number, operands)
+                values[id(number)] = fusion_barrier(value) if id(number) in fenced else value
+        return [jnp.asarray(read(v), dtype) for v, dtype in zip(self._outputs, self._dtypes, strict=True)]
+
+    def _fenced(self) -> set[int]:
+        """Numbers to be computed once, so that no consumer of a number repeats more than `_REPEATED` operations."""
+        uses: Counter[int] = Counter(id(v) for number in self.operations for v in number.operands)
+        uses.update(id(v) for v in self._outputs)
+        most = repeated()
+        weight: dict[int, int] = {}
+        fenced = set()
+        for number in self.operations:
+            own = number.name not in _FREE
+            total = own + sum(weight.get(id(v), 0) for v in number.operands)
+            if number.name in _ONCE or not np.issubdtype(number.dtype or np.bool_, np.floating):
+                total = 0 if number.name in _ONCE else total
+            elif uses[id(number)] > 1 and total >= most and own:
+                fenced.add(id(number))
+                total = 0
+            weight[id(number)] = total
+        return fenced
+
+    def count(self, stages: bool = False) -> Counter[str]:
+        """Operations by primitive, or by the outermost `jax.named_scope`."""
+        real = [v for v in self.operations if v.name not in _FREE]
+        return Counter(v.stage.split("/")[0] if stages else v.name for v in real)
+
+
+def scalar_program(closed: Any, moving: Sequence[bool] = ()) -> ScalarProgram:
+    """The program of a closed jaxpr over arrays; `moving` marks constants that are arguments as well, and come first."""
+    graph = Graph()
+
+    def arguments(variables: Sequence[Any]) -> list[np.ndarray]:
+        return [
+            collected([graph.input(v.aval.dtype) for _ in range(math.prod(v.aval.shape))], v.aval.shape)
+            for v in variables
+        ]
+
+    marks = list(moving) or [False] * len(closed.consts)
+    given = arguments([v for v, moves in zip(closed.jaxpr.constvars, marks, strict=True) if moves])
+    rest = iter(given)
+    consts = [next(rest) if moves else constants(c) for c, moves in zip(closed.consts, marks, strict=True)]
+    inputs = arguments(closed.jaxpr.invars)
+    outputs = evaluate(graph, closed.jaxpr, consts, inputs)
+    dtypes = [v.aval.dtype for v in closed.jaxpr.outvars]
+    return ScalarProgram([*given, *inputs], outputs, dtypes)
+
+
+def _needed(outputs: Sequence[Any]) -> list[Number]:
+    """All numbers behind the results, operands first."""
+    seen: set[int] = set()
+    order: list[Number] = []
+    stack = [(value, False) for value in outputs if not is_constant(value)]
+    while stack:
+        number, ready = stack.pop()
+        if ready:
+            order.append(number)
+        elif id(number) not in seen and number.name != "input":
+            seen.add(id(number))
+            stack.append((number, True))
+            stack += [(value, False) for value in number.operands if not is_constant(value) and id(value) not in seen]
+    return order
+
+
+def _bind(number: Number, operands: list[Any]) -> Any:
+    plain = _PLAIN.get(number.name)
+    if plain is not None:
+        return plain(*operands)
+    return number.equation.primitive.bind(*operands, **number.equation.params)

@@ -1,0 +1,106 @@
+"""`scan` and `call`: as `jax.lax.scan` and a plain call, but traced over single numbers where that pays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+
+from gsisio_jax.scalar.program import ScalarProgram, scalar_program
+
+MOST_NUMBERS = 60_000
+"""Numbers that a body may compute, arrays unrolled. Beyond, compiling takes longer than running can win back, and matrix
+products over arrays are as fast (`benchmarks/size.py` has the crossover)."""
+
+
+def scan(
+    body: Callable[..., Any],
+    carry: Any,
+    xs: Any,
+    length: int | None = None,
+    wrap: Callable[..., Any] = lambda step: step,
+) -> tuple[Any, Any]:
+    """``jax.lax.scan``. Packed and unpacked once, at the edge: between steps every number is a 0-d value, which
+    `jax.vmap` makes a vector over the batch. `wrap` is applied to the step (`jax.checkpoint`, say)."""
+    rows = jax.tree.leaves(xs)
+    length = rows[0].shape[0] if length is None else length
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
+    carry = jax.tree.map(jnp.asarray, carry)
+    traced = _trace(body, carry, one)
+    if traced is None:
+        return jax.lax.scan(wrap(body), carry, xs, length=length)
+    program, consts, structure = traced
+    flat_carry = jax.tree.leaves(carry)
+    count = sum(math.prod(leaf.shape) for leaf in flat_carry)
+
+    def step(numbers: Any, row: Any) -> tuple[Any, Any]:
+        out = program([*consts, *numbers, *row])
+        return tuple(out[:count]), tuple(out[count:])
+
+    numbers = tuple(entry for leaf in flat_carry for entry in _entries(leaf, 0))
+    columns = tuple(entry for leaf in rows for entry in _entries(leaf, 1))
+    last, kept = jax.lax.scan(wrap(step), numbers, columns, length=length)
+    leaves = program.results
+    packed = _packed([*last], leaves[: len(flat_carry)], ()) + _packed([*kept], leaves[len(flat_carry) :], (length,))
+    return jax.tree.unflatten(structure, packed)
+
+
+def call(function: Callable[..., Any], *args: Any) -> Any:
+    """``function(*args)``, computed over single numbers."""
+    args = jax.tree.map(jnp.asarray, args)
+    traced = _trace(function, *args)
+    if traced is None:
+        return function(*args)
+    program, consts, structure = traced
+    numbers = [entry for leaf in jax.tree.leaves(args) for entry in _entries(leaf, 0)]
+    return jax.tree.unflatten(structure, _packed(program([*consts, *numbers]), program.results, ()))
+
+
+def _trace(function: Callable[..., Any], *args: Any) -> tuple[ScalarProgram, list[Any], Any] | None:
+    """The program, entries of what the function closes over, and the structure of its results; None if too large."""
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+    if numbers_in(closed.jaxpr) > MOST_NUMBERS:
+        return None
+    moving = [isinstance(const, Tracer) for const in closed.consts]
+    program = scalar_program(closed, moving)
+    consts = [c for c, moves in zip(closed.consts, moving, strict=True) if moves]
+    return program, [entry for const in consts for entry in _entries(const, 0)], jax.tree.structure(shape)
+
+
+def numbers_in(jaxpr: Any) -> int:
+    """Entries of everything that a jaxpr computes; loops count once."""
+    total = 0
+    for eqn in jaxpr.eqns:
+        inner = [v for v in eqn.params.values() if hasattr(v, "jaxpr") or hasattr(v, "eqns")]
+        if inner:
+            total += sum(numbers_in(getattr(v, "jaxpr", v)) for v in inner)
+        else:
+            total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
+    return total
+
+
+def _entries(leaf: Any, lead: int) -> list[Any]:
+    """The entries of an array behind its first `lead` axes, each an array over those."""
+    if leaf.ndim == lead:
+        return [leaf]
+    flat = leaf.reshape(*leaf.shape[:lead], -1)
+    return [jax.lax.index_in_dim(flat, i, lead, keepdims=False) for i in range(flat.shape[lead])]
+
+
+def _packed(entries: list[Any], leaves: Sequence[jax.ShapeDtypeStruct], lead: tuple[int, ...]) -> list[Any]:
+    """Entries, each an array of shape `lead`, as arrays of their shapes behind that."""
+    out, start = [], 0
+    for leaf in leaves:
+        part = entries[start : start + leaf.size]
+        start += leaf.size
+        if leaf.shape == ():
+            out.append(part[0])
+        elif part:
+            out.append(jnp.stack(part, axis=len(lead)).reshape(*lead, *leaf.shape))
+        else:
+            out.append(jnp.zeros((*lead, *leaf.shape), leaf.dtype))
+    return out
