@@ -37,7 +37,7 @@ from gsisio_jax.inclusion.rules.registry import ELEMENTWISE
 from gsisio_jax.inclusion.rules.trig import Wave, wave_atom, wave_point
 from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, nan_to_unbounded
+from gsisio_jax.interval.box import Interval, choose, is_concrete, nan_to_unbounded
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
@@ -98,19 +98,36 @@ def wider(size: Any, terms: int) -> Any:
 
 
 class Rows(eqx.Module):
-    """Linear combinations ``states x + atoms a(x) + constant``: weights (r, n), (r, J) and (r,)."""
+    """Linear combinations ``states x + atoms a(x) + constant``: weights (r, n), (r, J) and (r,).
+
+    `lost` holds the sums of magnitudes that the weights were made of, (r, n) and (r, J), where they are not known while
+    tracing: what cancels in them is then rounded at the size of its parts. None where they were rounded once.
+    """
 
     states: Any
     atoms: Any
     constant: Any
+    lost: Any = None
 
     def joint(self, states: States, atoms: AtomBounds) -> tuple[Any, Any]:
         """Center and radius (r,), slopes combined before the box is applied."""
         slope = self.slope(atoms)
         center = matmul(slope, states.center) + matmul(self.atoms, atoms.center) + self.constant
         radius = scale(abs(slope), states.radius).sum(-1) + scale(abs(self.atoms), atoms.radius).sum(-1)
+        return center, radius + self.slip(states, atoms)
+
+    def slip(self, states: States, atoms: AtomBounds) -> Any:
+        """What the slopes of the states, the constant, and weights that were rounded are off by, (r,)."""
         slip = scale(abs(self.states), states.slip).sum(-1) + wider(jnp.asarray(abs(self.constant)), 0)
-        return center, radius + slip
+        if self.lost is None or not rounding.outward():
+            return slip
+        far = jnp.maximum(abs(atoms.range.lower), abs(atoms.range.upper))
+        size = scale(abs(atoms.slope), states.magnitude).sum(-1) + abs(atoms.center) + atoms.radius
+        size = jnp.maximum(size, jnp.where(jnp.isfinite(far), far, 0))
+        of_states, of_atoms = self.lost
+        return slip + wider(
+            scale(of_states, states.magnitude).sum(-1) + scale(of_atoms, size).sum(-1), self.atoms.shape[-1]
+        )
 
     def joint_box(self, states: States, atoms: AtomBounds) -> Interval:
         """The same as a box (r,)."""
@@ -126,15 +143,14 @@ class Rows(eqx.Module):
         weights = jnp.concatenate([jnp.asarray(self.states), jnp.asarray(self.atoms)], -1)
         lower = jnp.concatenate([states.wide.lower, atoms.range.lower])
         upper = jnp.concatenate([states.wide.upper, atoms.range.upper])
-        slip = wider(jnp.asarray(abs(self.constant)), 0)
         low, high = _sides(weights, lower, upper)
+        slip = wider(jnp.asarray(abs(self.constant)), 0) if self.lost is None else self.slip(states, atoms)
         return Interval.unchecked(low + (self.constant - slip), high + (self.constant + slip))
 
     def bounds(self, states: States, atoms: AtomBounds) -> Interval:
         """The intersection of both, box (r,)."""
-        center, radius = self.joint(states, atoms)
-        natural = self.natural(states, atoms)
-        return Interval.unchecked(raised(natural.lower, center - radius), cut(natural.upper, center + radius))
+        joint, natural = self.joint_box(states, atoms), self.natural(states, atoms)
+        return Interval.unchecked(raised(natural.lower, joint.lower), cut(natural.upper, joint.upper))
 
 
 def _sides(weights: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
@@ -193,7 +209,9 @@ class Expansion:
         return self.n + len(self.atoms) + 1
 
     def rows(self, weights: Any, dtype: Any, minus: Any = None) -> Rows:
-        """``weights @ function - minus @ x`` for constant weights (r, outputs), in fractions until the end."""
+        """``weights @ function - minus @ x``, weights (r, outputs); in fractions until the end if they are known."""
+        if not (is_concrete(weights) and is_concrete(minus)):
+            return self._traced_rows(jnp.asarray(weights, dtype), dtype, minus)
         weights = np.asarray(weights, np.float64)
         minus = np.zeros((len(weights), self.n)) if minus is None else np.asarray(minus, np.float64)
         states = np.zeros((len(weights), self.n), dtype)
@@ -208,6 +226,17 @@ class Expansion:
                 (states if k < self.n else atoms)[r, k - (0 if k < self.n else self.n)] = float(value)
             constant[r] = float(total.constant)
         return Rows(states, atoms, constant)
+
+    def _traced_rows(self, weights: Any, dtype: Any, minus: Any) -> Rows:
+        each = self.rows(np.eye(len(self.outputs)), dtype)
+        states, size = matmul(weights, each.states), matmul(abs(weights), abs(each.states))
+        if minus is not None:
+            states, size = states - minus, size + abs(minus)
+        lost = size, matmul(abs(weights), abs(each.atoms))
+        # A constant is rounded at the size of its parts: it becomes part of an error that is there anyway.
+        constant = matmul(weights, each.constant)
+        lost = lost[0], lost[1]
+        return Rows(states, matmul(weights, each.atoms), constant, lost)
 
     def bounds(
         self, states: States, u: Any, wanted: Sequence[bool] | None = None, with_values: bool = False
@@ -262,7 +291,10 @@ class Expansion:
 
     def used_by(self, *rows: Rows) -> list[bool]:
         """Which atoms have a weight in some row."""
-        return [any(bool(np.any(row.atoms[:, j])) for row in rows) for j in range(len(self.atoms))]
+        return [
+            any(not is_concrete(row.atoms) or bool(np.any(row.atoms[:, j])) for row in rows)
+            for j in range(len(self.atoms))
+        ]
 
     def _needed(self, wanted: Sequence[bool] | None) -> list[bool]:
         needed = [True] * len(self.atoms) if wanted is None else list(wanted)

@@ -28,6 +28,7 @@ class Fixed:
         self._identity = structure, digest.digest()
         self._hash = hash(self._identity)
         self.value = jax.tree.unflatten(structure, arrays)
+        object.__setattr__(self.value, "_fixed", self)
 
     def __hash__(self) -> int:
         return self._hash

@@ -7,18 +7,38 @@ of the two it has.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.expansion import AtomBounds, Expansion, Rows, States, expand, widened, wider
 from gsisio_jax.inclusion.intersection import DEFAULT, bound
-from gsisio_jax.interval.box import Interval, reach
+from gsisio_jax.interval.box import Interval, is_concrete, reach
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.measurement import value_at
 from gsisio_jax.observer.types import Observer
+
+
+class Plain:
+    """The maps of a system as a key: two systems with the same f, g and sizes have the same expansion."""
+
+    def __init__(self, system: Any):
+        self.maps, self.n, self.m = system.maps, system.n, system.m
+        self._key = system.f, system.g, system.f_takes_u, system.g_takes_u, system.n, system.l, system.m
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Plain) and self._key == other._key
+
+
+@lru_cache(maxsize=64)
+def _expansion(plain: Plain, dtype: Any) -> Expansion | None:
+    return expand(plain.maps, plain.n, plain.m, dtype)
 
 
 @dataclass(frozen=True)
@@ -28,7 +48,8 @@ class Maps:
     Attributes:
         observer: with concrete gains, or traced ones.
         dtype: of the data.
-        expansion: None where f and g are bounded over arrays: traced gains, other methods than the default, large maps.
+        expansion: None where f and g are bounded over arrays: other methods than the default, large maps, or operations that
+            are no functions of single numbers.
     """
 
     observer: Observer
@@ -37,10 +58,10 @@ class Maps:
 
     @classmethod
     def of(cls, observer: Observer, dtype: Any) -> Maps:
+        # What is concrete is a constant of the program, also where JAX holds it.
+        observer = jax.tree.map(lambda leaf: np.asarray(leaf) if is_concrete(leaf) else leaf, observer)
         system = observer.system
-        weights = (observer.gains.residual, observer.inverses.residual, observer.exact.rows, observer.T2, observer.C)
-        small = observer.bounds == DEFAULT and all(isinstance(w, np.ndarray) for w in weights)
-        found = expand(system.maps, system.n, system.m, dtype) if small else None
+        found = _expansion(Plain(system), np.dtype(dtype)) if observer.bounds == DEFAULT else None
         return cls(observer, dtype, found)
 
     @property
@@ -101,7 +122,8 @@ class Maps:
     def _free_rows(self, minus: Any) -> Rows:
         T2, n = self.observer.T2, self.observer.system.n
         if self.expansion is not None:
-            weights = np.concatenate([np.zeros((len(T2), n)), T2], axis=1)
+            xp = np if is_concrete(T2) else jnp
+            weights = xp.concatenate([xp.zeros((T2.shape[0], n)), T2], axis=1)
             return self.expansion.rows(weights, self.dtype, minus)
         return self._over_arrays(jnp.eye(T2.shape[0], dtype=self.dtype), minus)
 

@@ -152,7 +152,7 @@ def _finish(
     )
     d1 = _current_input(observer.current, h, _sorted(x), output_box(system, y, u, noise.v))
     after = Carry(x, h, y, u, noise, jnp.asarray(False), jnp.asarray(True))
-    return after, StepOutput(x, d, d1, bit_mask(bits), *domain.tightest())
+    return after, StepOutput(x, d, d1, bit_mask(bits), *domain.report())
 
 
 def _current_input(current: Any, h: AffineForm, state: Interval, output: Interval) -> Interval:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from gsisio_jax import scalar
@@ -11,6 +13,7 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import prediction_step
 from gsisio_jax.observer import step as current_step
 from gsisio_jax.observer.checks import AnyObserver
+from gsisio_jax.observer.fixed import Fixed, chosen, fixed
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.types import Carry, StepOutput
 from gsisio_jax.plant.system import Noise
@@ -33,6 +36,14 @@ def blank(observer: AnyObserver, initial: Interval) -> Carry:
 
 def advance(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
     """One step of the recursion that belongs to this kind of observer."""
+    return _advance(*fixed(observer), carry, y, u, noise, hold)
+
+
+# Inlined, so programs are as if this were a plain function; but what JAX traced of a step once serves every batch, scan
+# and study of that observer.
+@partial(jax.jit, static_argnames=("static", "hold"), inline=True)
+def _advance(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    observer = chosen(static, traced)
     return _module(observer).advance(observer, carry, y, u, noise, hold)
 
 

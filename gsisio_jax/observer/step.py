@@ -20,6 +20,7 @@ from gsisio_jax.interval.box import (
     choose,
     entire_like,
     image,
+    is_concrete,
     nan_to_unbounded,
     plain_image,
     reach,
@@ -203,29 +204,14 @@ def _predicted(
 
 def _open_loop(maps: Maps, domain: Domain, past: States, carry: Carry, terms: Terms) -> Domain:
     """``x = f + B u + G d + w`` in the rows that no input without bounds reaches."""
-    system = maps.observer.system
-    limits = system.input_bounds
-    known = all(isinstance(side, np.ndarray) for side in (system.G, limits.lower, limits.upper))
-    if not known:
+    n, l = maps.observer.system.n, maps.observer.system.l
+    drift = terms.shift[:n]
+    through = image(maps.observer.system.G, maps.observer.system.input_bounds)
+    if is_concrete(through.lower) and not np.isfinite(through.lower).any():
         return domain
-    finite = np.isfinite(limits.lower) & np.isfinite(limits.upper)
-    plain = ~((system.G != 0) & ~finite).any(axis=1)
-    if not plain.any():
-        return domain
-    weights = np.eye(system.n, system.n + system.l)[plain]
-    drift = terms.shift[: system.n][np.flatnonzero(plain)]
-    if (system.G[plain] != 0).any():
-        drift = add(
-            drift,
-            image(
-                system.G[plain], Interval.unchecked(*(jnp.where(finite, s, 0) for s in (limits.lower, limits.upper)))
-            ),
-        )
-    found = maps.rows(weights).bounds(past, carry.h)
-    low, high = entire_like(domain.box).lower, entire_like(domain.box).upper
-    for i, j in enumerate(np.flatnonzero(plain)):
-        low = low.at[j].set(found.lower[i] + drift.lower[i])
-        high = high.at[j].set(found.upper[i] + drift.upper[i])
+    found = maps.rows(np.eye(n, n + l)).bounds(past, carry.h)
+    low = jnp.where(through.lower > -jnp.inf, found.lower + drift.lower + through.lower, -jnp.inf)
+    high = jnp.where(through.upper < jnp.inf, found.upper + drift.upper + through.upper, jnp.inf)
     return domain.intersect(Interval.unchecked(low, high)[None], Source.DYNAMICS)
 
 
@@ -426,8 +412,9 @@ def _joined(*boxes: Interval) -> Interval:
 def _beyond_inverses(observer: Observer) -> Any:
     """Which rows of the exact box (K, p) are not those of a left inverse as well, which bounds f and g jointly."""
     exact, inverses = observer.exact.rows, observer.inverses
-    if not (isinstance(exact, np.ndarray) and isinstance(inverses.residual, np.ndarray)):
+    if not all(map(is_concrete, jax.tree.leaves((exact, inverses)))):
         return True
+    exact, inverses = jax.tree.map(np.asarray, (exact, inverses))
     direct = [j for j in range(len(inverses.residual)) if not (inverses.remainder[j].any() or inverses.output[j].any())]
     old = np.zeros(exact.shape[:2], bool)
     for j in direct:
@@ -478,11 +465,8 @@ def _limited(box: Interval) -> Interval:
 def _current_input(maps: Maps, states: States, h: AtomBounds, output: Interval, believed: Any) -> Interval:
     """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
     current, n = maps.observer.current, maps.observer.system.n
-    weights = (
-        jnp.concatenate([jnp.zeros((current.shape[0], n)), -current], 1)
-        if not isinstance(current, np.ndarray)
-        else np.concatenate([np.zeros((len(current), n)), -current], 1)
-    )
+    xp = np if is_concrete(current) else jnp
+    weights = xp.concatenate([xp.zeros((current.shape[0], n)), -current], 1)
     found = maps.rows(weights).bounds(states, h)
     seen = plain_image(current, widened(output, output.shape[0]))
     return _if(believed, nan_to_unbounded(Interval.unchecked(found.lower + seen.lower, found.upper + seen.upper)))

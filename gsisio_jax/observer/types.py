@@ -202,8 +202,14 @@ def in_type(observer: Observer, dtype: Any) -> Observer:
 def cast(tree: Any, dtype: Any) -> Any:
     """A pytree of boxes, planes and arrays in another floating type; boxes and planes are rounded outward."""
     bounds = Interval | Abstraction
+
+    def converted(leaf: Any) -> Any:
+        if isinstance(leaf, bounds):
+            return leaf.astype(dtype)
+        return jnp.asarray(leaf) if jnp.result_type(leaf) == bool else jnp.asarray(leaf, dtype)
+
     return jax.tree.map(
-        lambda leaf: leaf.astype(dtype) if isinstance(leaf, bounds) else jnp.asarray(leaf, dtype),
+        converted,
         tree,
         is_leaf=lambda leaf: isinstance(leaf, bounds),
     )

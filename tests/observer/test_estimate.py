@@ -119,14 +119,11 @@ def assert_equal(got: Any, expected: Any, rtol: float = 1e-12):
 def numpy_loop(run: Run, hold: bool = False, noise: Any = None) -> gx.Estimate:
     """The same step in a Python loop over rows, every operation by NumPy."""
     observer, noise = run.observer.astype(np.float64), noise or (lambda k: run.noise)
-    first = numpy_function(
-        partial(advance, observer, hold=hold), blank(observer, run.initial), run.y[0], run.u[0], noise(0)
-    )
-    carry, out = first(run.initial, run.y[0], run.u[0], noise(0))
-    following = numpy_function(partial(advance, observer, hold=hold), carry, run.y[1], run.u[1], noise(1))
-    outputs = [out]
-    for k in range(1, len(run.y)):
-        carry, out = following(carry, run.y[k], run.u[k], noise(k))
+    carry = blank(observer, run.initial)
+    step = numpy_function(partial(advance, observer, hold=hold), carry, run.y[0], run.u[0], noise(0))
+    outputs = []
+    for k in range(len(run.y)):
+        carry, out = step(carry, run.y[k], run.u[k], noise(k))
         outputs.append(out)
     return gx.estimation.collect(observer, outputs)
 
@@ -258,7 +255,7 @@ def test_new_numbers_compile_nothing(small):
         gx.estimate(small.observer, small.initial, small.y[:3])
         assert compiled
         assert len(traces) == before
-        gx.estimate(small.observer, small.initial, small.y[:3], rounding="outward")  # the counter does count
+        gx.estimate(small.observer, small.initial, small.y[:3], rounding="nearest")  # the counter does count
         assert len(traces) > before
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
@@ -301,7 +298,8 @@ def test_a_float32_carry_goes_on_with_float64_data(small):
     assert carry.state.dtype == np.float32
     stepped, out = gx.step(small.observer, carry, small.y[1])
     resumed, rows = gx.estimation.resume(small.observer, carry, small.y[1:])
-    assert {leaf.dtype for leaf in jax.tree.leaves((stepped, resumed))} == {np.dtype(np.float64)}
+    numbers = [leaf.dtype for leaf in jax.tree.leaves((stepped, resumed)) if leaf.dtype != bool]
+    assert set(numbers) == {np.dtype(np.float64)}
     np.testing.assert_allclose(rows.state.upper[0], out.state.upper, rtol=1e-12)
     exact = gx.estimate(small.observer, small.initial, small.y)
     np.testing.assert_allclose(rows.state.upper, exact.state.upper[1:], rtol=1e-5)

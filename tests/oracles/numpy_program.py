@@ -40,7 +40,7 @@ def _run(jaxpr: Any, consts: list[Any], args: list[Any]) -> list[Any]:
         inner = p.get("call_jaxpr", p.get("jaxpr"))
         if inner is not None:  # jit, custom_jvp_call, ...
             outputs = _run(inner.jaxpr, [np.asarray(c) for c in inner.consts], inputs)
-        elif name in ("optimization_barrier", "once"):
+        elif name in ("optimization_barrier", "fusion_barrier"):
             outputs = inputs
         elif name in _ELEMENTWISE:
             outputs = [_ELEMENTWISE[name](*inputs)]
@@ -77,7 +77,10 @@ def _broadcast(p: Any, x: Any, *_: Any) -> Any:
 def _dot(p: Any, a: Any, b: Any) -> Any:
     (ca, cb), (ba, bb) = p["dimension_numbers"]
     if ba or bb:
-        raise NotImplementedError("NumPy program: batched dot")
+        assert tuple(ba) == tuple(bb) == (0,)
+        rows = [_dot({"dimension_numbers": (([i - 1 for i in ca], [i - 1 for i in cb]), ((), ()))}, x, y)
+                for x, y in zip(a, b, strict=True)]  # fmt: skip
+        return np.stack(rows)
     return np.tensordot(a, b, axes=(list(ca), list(cb)))
 
 
@@ -132,6 +135,15 @@ _ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "not": np.invert,
     "clamp": lambda low, x, high: np.clip(x, low, high),
     "select_n": _select,
+    # Of the library itself, as their docstrings define them.
+    "scale": lambda factor, value: np.where(factor == 0, 0, factor * value),
+    "times": lambda a, b: np.where(np.isnan(a * b), 0, a * b),
+    "smaller": np.minimum,
+    "larger": np.maximum,
+    "raised": lambda lower, other: np.where(np.isnan(other), lower, np.maximum(lower, other)),
+    "cut": lambda upper, other: np.where(np.isnan(other), upper, np.minimum(upper, other)),
+    "wave": lambda value, t, slope: value,
+    "falling_wave": lambda value, t, slope: value,
 }
 
 _SHAPED: dict[str, Callable[..., Any]] = {
