@@ -41,7 +41,7 @@ from gsisio_jax.interval.box import Interval, choose, is_concrete, nan_to_unboun
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
-from gsisio_jax.scalar.unroll import collected, evaluate
+from gsisio_jax.scalar.unroll import collected, evaluate, numbers_in
 
 _MOST_OPERATIONS = 400  # of f and g together; beyond, bounds come from the engine over arrays
 FLUSHED = 2.0**60  # in smallest normal numbers
@@ -97,6 +97,12 @@ def wider(size: Any, terms: int) -> Any:
     return jax.lax.stop_gradient(size) * kappa + floor
 
 
+def of_constant(constant: Any) -> Any:
+    """What a constant of a row is off by; nothing where it is 0."""
+    size = jnp.asarray(abs(constant))
+    return jnp.where(size == 0, 0, wider(size, 0))
+
+
 class Rows(eqx.Module):
     """Linear combinations ``states x + atoms a(x) + constant``: weights (r, n), (r, J) and (r,).
 
@@ -118,7 +124,7 @@ class Rows(eqx.Module):
 
     def slip(self, states: States, atoms: AtomBounds) -> Any:
         """What the slopes of the states, the constant, and weights that were rounded are off by, (r,)."""
-        slip = scale(abs(self.states), states.slip).sum(-1) + wider(jnp.asarray(abs(self.constant)), 0)
+        slip = scale(abs(self.states), states.slip).sum(-1) + of_constant(self.constant)
         if self.lost is None or not rounding.outward():
             return slip
         far = jnp.maximum(abs(atoms.range.lower), abs(atoms.range.upper))
@@ -144,7 +150,7 @@ class Rows(eqx.Module):
         lower = jnp.concatenate([states.wide.lower, atoms.range.lower])
         upper = jnp.concatenate([states.wide.upper, atoms.range.upper])
         low, high = _sides(weights, lower, upper)
-        slip = wider(jnp.asarray(abs(self.constant)), 0) if self.lost is None else self.slip(states, atoms)
+        slip = of_constant(self.constant) if self.lost is None else self.slip(states, atoms)
         return Interval.unchecked(low + (self.constant - slip), high + (self.constant + slip))
 
     def bounds(self, states: States, atoms: AtomBounds) -> Interval:
@@ -484,7 +490,7 @@ def expand(function: Callable[..., Any], n: int, m: int, dtype: Any) -> Expansio
     """The expansion of ``function(x, u)``, x (n,) and u (m,); None where it is too large, or holds operations (loops,
     comparisons, library calls) that the engine over arrays knows better."""
     closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype))
-    if _size(closed.jaxpr) > 4 * _MOST_OPERATIONS or len(closed.out_avals) != 1:
+    if numbers_in(closed.jaxpr) > 4 * _MOST_OPERATIONS or len(closed.out_avals) != 1:
         return None
     graph = Graph()
     inputs = [collected([graph.input(dtype) for _ in range(size)], (size,)) for size in (n, m)]
@@ -492,19 +498,6 @@ def expand(function: Callable[..., Any], n: int, m: int, dtype: Any) -> Expansio
         return None
     (out,) = evaluate(graph, closed.jaxpr, closed.consts, inputs)
     return _Reader(n, inputs, dtype).expansion(out)
-
-
-def _size(jaxpr: Any) -> int:
-    """Entries of everything that a jaxpr computes, loops unrolled."""
-    total = 0
-    for eqn in jaxpr.eqns:
-        inner = [v for v in eqn.params.values() if hasattr(v, "jaxpr") or hasattr(v, "eqns")]
-        turns = eqn.params.get("length", 1) if eqn.primitive.name == "scan" else 1
-        if inner:
-            total += sum(turns * _size(getattr(v, "jaxpr", v)) for v in inner)
-        else:
-            total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
-    return total
 
 
 _LINEAR = {"add", "sub", "neg", "copy", "stop_gradient", "convert_element_type"}

@@ -38,9 +38,11 @@ from gsisio_jax.inclusion.rules import comparison, linear
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.scalar.unroll import numbers_in
 
-# Longer loops are kept as loops: compile time grows with every unrolled turn.
+# Longer loops, and loops over more operations, are kept as loops: compile time grows with every unrolled turn.
 _UNROLL = 16
+_UNROLLED_NUMBERS = 120
 _OURS, _JAX = os.path.dirname(__file__), os.path.dirname(jax.__file__)
 
 
@@ -152,7 +154,7 @@ def _scan(eqn: Any, *args: Any) -> Any:
         out = evaluate(body.jaxpr, body.consts, [*consts, *carry, *rows])
         return list(out[:n_carry]), list(out[n_carry:])
 
-    if length > _UNROLL:
+    if length > _UNROLL or (length > 1 and length * numbers_in(body.jaxpr) > _UNROLLED_NUMBERS):
         return _loop(turn, carry, xs, length, reverse)
     stacked: list[Any] = [None] * length
     for i in range(length)[::-1] if reverse else range(length):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.expansion import AtomBounds, Rows, States, wider
+from gsisio_jax.inclusion.expansion import AtomBounds, Rows, States, of_constant, wider
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.minmax import larger, smaller
@@ -34,7 +34,7 @@ def affine_rows(rows: Rows, states: States, atoms: AtomBounds) -> Affine:
     """Linear combinations of atoms as affine bounds; the radius holds what the slope is off by."""
     center = matmul(rows.atoms, atoms.center) + rows.constant
     radius = scale(abs(rows.atoms), atoms.radius).sum(-1) + scale(abs(rows.states), states.slip).sum(-1)
-    return Affine(rows.slope(atoms), center, radius + wider(jnp.asarray(abs(rows.constant), center.dtype), 0))
+    return Affine(rows.slope(atoms), center, radius + of_constant(rows.constant))
 
 
 def contract_affine_rows(states: States, form: Affine, z: Interval) -> tuple[Interval, Any]:
@@ -119,8 +119,8 @@ def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, term
 def center_and_radius(box: Interval, terms: int) -> tuple[Any, Any]:
     """Center and radius of a box, the latter widened for linear images of so many terms; an infinite side makes it
     infinite."""
-    center = box.center
     radius = 0.5 * (box.upper - box.lower)
+    center = jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0)
     return center, radius + wider(abs(center) + radius, terms)
 
 
@@ -147,11 +147,11 @@ def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
 
 
 def centred_form(
-    right: Interval, N_z: Any, inverse: Any, remainder: Any, start: Any, within: Interval, terms: int, left: Any = None
+    right: Interval, N_z: Any, inverse: Any, remainder: Any, within: Interval, terms: int, left: Any = None
 ) -> Interval:
     """Bound x by its distance from one point c, where ``x + N_z psi(x) in right`` and x lies in `within`.
 
-    With ``mid +- rad = right``, any b in `within`, ``c = clip(mid - N_z psi(b))`` and r = |c - b|: clipping is
+    With ``mid +- rad = right``, ``b = clip(mid)`` and ``c = clip(mid - N_z psi(b))``, r = |c - b|: clipping is
     nonexpansive, so ``|x - c| <= rad + |N_z| R |x - b| <= rad + |N_z| R (|x - c| + r)``, hence ``|x - c| <= V rad +
     V |N_z| R r <= V (rad + r) - r`` for ``V (I - |N_z| R) >= I``.
 
@@ -160,7 +160,6 @@ def centred_form(
         N_z: (n, q).
         inverse: V >= 0 with ``V (I - |N_z| R - left) >= I``, (n, n).
         remainder: psi at a point, as center and radius (q,).
-        start: b before it is clipped, (n,).
         within: box (n,) on which R holds and in which x is known to lie.
         terms: of a row, for rounding.
         left: (n, n), what `right` leaves of x by rounding.
@@ -168,7 +167,7 @@ def centred_form(
     Source: design 4.3, steps 3 and 6.
     """
     middle, radius = center_and_radius(right, terms)
-    before = clip(start, within)
+    before = clip(middle, within)
     center, slip = remainder(before)
     c = clip(middle - matmul(N_z, center), within)
     slip = matmul(abs(N_z), slip) + wider(abs(middle) + matmul(abs(N_z), abs(center)), terms)

@@ -24,7 +24,8 @@ class Domain(eqx.Module):
             record may itself hold rounded numbers (noise on its bound, zero noise), which miss the plant by as much.
         gap: the smallest slack of all; below ``-tolerance`` the data contradict the stated bounds. (Apart from the margin,
             because where nobody asks for the margin it costs nothing.)
-        margin: signed slack of the first intersection that was empty (its largest gap), else the smallest slack.
+        margin: signed slack of the first intersection that was empty (its largest gap), else the smallest slack; None
+            as long as there was no intersection.
         source: which piece that was, ``Source * SOURCE_STRIDE + index``.
     """
 
@@ -38,25 +39,30 @@ class Domain(eqx.Module):
     def of(cls, box: Interval, size: Any) -> Domain:
         """Nothing intersected yet; `size` is the largest number that entered the step."""
         none = jnp.asarray(jnp.inf, box.dtype)
-        return cls(box, _ROUNDING * float(jnp.finfo(box.dtype).eps) * size, none, none, jnp.int32(0))
+        return cls(box, _ROUNDING * float(jnp.finfo(box.dtype).eps) * size, none, None, None)
 
     def with_box(self, box: Interval) -> Domain:
         return Domain(box, self.tolerance, self.gap, self.margin, self.source)
 
     def record_margin(self, slack: Any, kind: Source) -> Domain:
         """Note the slacks (k,) of an intersection that leaves the box as it is; NaN (it overflowed) says nothing."""
-        best, code, gap = jnp.asarray(jnp.inf, self.box.dtype), jnp.int32(0), self.gap
-        for i in range(slack.shape[0]):
+        if not slack.shape[0]:
+            return self
+        first = int(kind) * SOURCE_STRIDE
+        best, code, gap = cut(jnp.asarray(jnp.inf, self.box.dtype), slack[0]), jnp.int32(first), cut(self.gap, slack[0])
+        for i in range(1, slack.shape[0]):
             # No argmin and no gather: both are slow in batches.
-            code = jnp.where(slack[i] < best, jnp.int32(int(kind) * SOURCE_STRIDE + i), code)
+            code = jnp.where(slack[i] < best, jnp.int32(first + i), code)
             best, gap = cut(best, slack[i]), cut(gap, slack[i])
         return self._noted(best, code, gap)
 
     def taken(self, other: Domain) -> Domain:
         """Note what was found for another box of the same step."""
-        return self._noted(other.margin, other.source, cut(self.gap, other.gap))
+        return self if other.margin is None else self._noted(other.margin, other.source, cut(self.gap, other.gap))
 
     def _noted(self, margin: Any, source: Any, gap: Any) -> Domain:
+        if self.margin is None:
+            return Domain(self.box, self.tolerance, gap, margin, source)
         new = (margin < self.margin) & ~(self.margin < -self.tolerance)
         margin, source = jnp.where(new, margin, self.margin), jnp.where(new, source, self.source)
         return Domain(self.box, self.tolerance, gap, margin, source)
@@ -101,6 +107,8 @@ class Domain(eqx.Module):
 
     def report(self) -> tuple[Any, Any]:
         """Margin and source; a gap within the tolerance counts as 0."""
+        if self.margin is None:
+            return jnp.asarray(jnp.inf, self.box.dtype), jnp.int32(0)
         margin = jnp.where((self.margin < 0) & (self.margin >= -self.tolerance), 0, self.margin)
         return margin, jnp.where(jnp.isinf(margin), 0, self.source)
 

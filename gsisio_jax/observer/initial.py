@@ -66,9 +66,7 @@ def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: A
             return at_point(maps.remainder, x, wider(abs(x), maps.terms), *maps.free_at(x, u))
 
         bounds = observer.system.state_bounds
-        box = centred_form(
-            right[k], gains.remainder[k], first.inverses[i], psi, right[k].center, bounds, maps.terms, left
-        )
+        box = centred_form(right[k], gains.remainder[k], first.inverses[i], psi, bounds, maps.terms, left)
         box = choose(in_box(u, observer.u_region), box, entire_like(box))
         domain = domain.intersect(box[None], Source.STATE)
     if first.linear and first.form is not None:

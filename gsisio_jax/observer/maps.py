@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.expansion import AtomBounds, Expansion, Rows, States, expand, widened, wider
+from gsisio_jax.inclusion.expansion import AtomBounds, Expansion, Rows, States, expand, of_constant, widened, wider
 from gsisio_jax.inclusion.intersection import DEFAULT, bound
 from gsisio_jax.interval.box import Interval, is_concrete, reach
 from gsisio_jax.interval.primitives import matmul, scale
@@ -141,4 +141,4 @@ def at_point(rows: Rows, x: Any, slip: Any, value: Any, value_slip: Any) -> tupl
     """Center and radius (r,) of a linear combination at a point x, from values of the atoms there."""
     center = matmul(rows.states, x) + matmul(rows.atoms, value) + rows.constant
     radius = matmul(abs(rows.states), slip) + scale(abs(rows.atoms), value_slip).sum(-1)
-    return center, radius + wider(jnp.asarray(abs(rows.constant), center.dtype), 0)
+    return center, radius + of_constant(rows.constant)

@@ -25,7 +25,6 @@ from gsisio_jax.interval.box import (
     plain_image,
     reach,
     slip,
-    spread,
     widened,
 )
 from gsisio_jax.interval.minmax import cut, raised, smaller
@@ -116,7 +115,7 @@ def _known(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) -> _K
 
 def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[Domain, Domain, Interval]:
     """The box of x[k], the box that y[k] and the state bounds alone give, and the box of d[k-1]."""
-    observer, system = maps.observer, maps.observer.system
+    observer, system, constants = maps.observer, maps.observer.system, maps.observer.rounding_constants
     known, before, bounds = _known(observer, carry, y, u, noise), carry.state, system.state_bounds
     size = largest_magnitude(y, carry.y, before.lower, before.upper)
 
@@ -136,8 +135,9 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         domain = _output(domain, maps.states(domain.box), first_form(observer, domain.box, u), known.z)
         lost = _Lost(observer, d_fixed)
         domain = initial_boxes(maps, domain, right, lost.inputs, u)
-        right = _plainly_wider(right, lost.radius(observer.rounding_constants.gains, domain.box))
-        d_fixed = _plainly_wider(d_fixed, lost.radius(observer.rounding_constants.inverses, domain.box))
+        # What the gains leave of x[k] and d[k-1]: smaller boxes to come can only make it smaller.
+        left = [lost.radius(of, domain.box) for of in (constants.gains, constants.inverses)]
+        right, d_fixed = _plainly_wider(right, left[0]), _plainly_wider(d_fixed, left[1])
 
     # 4. Sweeps: T2 g on the box so far, every row solved for every state, and (*) solved for x[k].
     with _stage("sweeps"):
@@ -163,11 +163,11 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         domain = _open_loop(maps, domain, past, carry, known.terms)
 
     # 5. The certified bound, where both boxes lie in the region.
-    domain, promised = _certified(maps, domain, past, carry, right, known, lost, u)
+    domain, promised = _certified(maps, domain, past, carry, right, known, left[0], u)
     with _stage("inputs"):
         states = maps.states(domain.box)
         d, domain = _inputs(maps, domain, states, d_fixed, psi)
-        d, domain = _certified_input(maps, domain, states, promised, known, lost, d)
+        d, domain = _certified_input(maps, domain, states, promised, known, left[1], d)
         d, domain = _exact_input(maps, domain, past, carry, known.terms, d, lost)
     return domain, alone, d
 
@@ -256,7 +256,7 @@ class _Promised(NamedTuple):
 
 @_stage("certified")
 def _certified(
-    maps: Maps, domain: Domain, past: States, carry: Carry, right: Interval, known: _Known, lost: _Lost, u: Any
+    maps: Maps, domain: Domain, past: States, carry: Carry, right: Interval, known: _Known, left: Any, u: Any
 ) -> tuple[Domain, _Promised | None]:
     """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""
     observer, certificate, before = maps.observer, maps.observer.certificate, carry.state
@@ -271,7 +271,7 @@ def _certified(
     promised = _Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.slip))
     gains, constants = observer.gains, observer.rounding_constants
     around = _around(maps, gains.residual[0], constants.growth, promised, known.right[0])
-    around = _plainly_wider(around, _first(lost.radius(constants.gains, domain.box)))
+    around = _plainly_wider(around, _first(left))
     joint, slack = _met(right[0], around)
     domain = domain.record_margin(jnp.where(applies, slack, jnp.inf), Source.STATE)
     joint = choose(applies, joint, Interval.unchecked(c, c))
@@ -280,7 +280,7 @@ def _certified(
     def psi(x: Any) -> tuple[Any, Any]:
         return at_point(maps.remainder, x, wider(abs(x), maps.terms), *maps.free_at(x, u))
 
-    box = centred_form(joint, gains.remainder[0], observer.region_inverse, psi, joint.center, safe, maps.terms)
+    box = centred_form(joint, gains.remainder[0], observer.region_inverse, psi, safe, maps.terms)
     return domain.intersect(_if(applies, box)[None], Source.CERTIFICATE), promised
 
 
@@ -298,7 +298,7 @@ def _around(maps: Maps, weights: Any, slope: Any, promised: _Promised, known: In
     No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
     """
     center, radius = at_point(maps.rows(weights), promised.center, promised.slip, *promised.atoms)
-    radius = radius + spread(slope, promised.radius)
+    radius = radius + matmul(jnp.asarray(slope, radius.dtype), promised.radius)
     radius = radius + wider(abs(center) + radius, 0)
     return Interval.unchecked(center - radius + known.lower, center + radius + known.upper)
 
@@ -333,7 +333,7 @@ def _certified_input(
     states: States,
     promised: _Promised | None,
     known: _Known,
-    lost: _Lost,
+    left: Any,
     d: Interval,
 ) -> tuple[Interval, Domain]:
     """The same centred form for d[k-1] with the first left inverse."""
@@ -342,7 +342,7 @@ def _certified_input(
         return d, domain
     inverses, constants = observer.inverses, observer.rounding_constants
     around = _around(maps, inverses.residual[0], constants.input_growth, promised, known.inputs[0])
-    around = _plainly_wider(around, _first(lost.radius(constants.inverses, domain.box)))
+    around = _plainly_wider(around, _first(left))
     now = plain_image(inverses.state[0], states.wide)
     box = Interval.unchecked(now.lower + around.lower, now.upper + around.upper)
     met, slack = _met(d, _if(promised.applies, box))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
+from gsisio_jax.scalar.unroll import numbers_in
 
 MOST_NUMBERS = 60_000
 """Numbers that a body may compute, arrays unrolled. Beyond, compiling takes longer than running can win back, and matrix
@@ -69,18 +70,6 @@ def _trace(function: Callable[..., Any], *args: Any) -> tuple[ScalarProgram, lis
     program = scalar_program(closed, moving)
     consts = [c for c, moves in zip(closed.consts, moving, strict=True) if moves]
     return program, [entry for const in consts for entry in _entries(const, 0)], jax.tree.structure(shape)
-
-
-def numbers_in(jaxpr: Any) -> int:
-    """Entries of everything that a jaxpr computes; loops count once."""
-    total = 0
-    for eqn in jaxpr.eqns:
-        inner = [v for v in eqn.params.values() if hasattr(v, "jaxpr") or hasattr(v, "eqns")]
-        if inner:
-            total += sum(numbers_in(getattr(v, "jaxpr", v)) for v in inner)
-        else:
-            total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
-    return total
 
 
 def _entries(leaf: Any, lead: int) -> list[Any]:

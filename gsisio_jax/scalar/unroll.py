@@ -226,3 +226,15 @@ _MOVES: dict[str, Callable[..., Sequence[Any]]] = {
     "rev": lambda eqn, x: [np.flip(x, eqn.params["dimensions"])],
     "split": lambda eqn, x: np.split(x, np.cumsum(eqn.params["sizes"])[:-1], axis=eqn.params["axis"]),
 }  # fmt: skip
+
+
+def numbers_in(jaxpr: Any) -> int:
+    """Entries of everything that a jaxpr computes; loops count once."""
+    total = 0
+    for eqn in jaxpr.eqns:
+        inner = [v for v in eqn.params.values() if hasattr(v, "jaxpr") or hasattr(v, "eqns")]
+        if inner:
+            total += sum(numbers_in(getattr(v, "jaxpr", v)) for v in inner)
+        else:
+            total += sum(math.prod(v.aval.shape) for v in eqn.outvars)
+    return total
