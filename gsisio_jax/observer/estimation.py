@@ -14,7 +14,7 @@ from gsisio_jax import scalar
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.alarms import Alarm, read_alarms
-from gsisio_jax.observer.checks import AnyObserver, check_length, check_on_conflict, prepare
+from gsisio_jax.observer.checks import AnyObserver, check_length, check_on_conflict, normal, prepare
 from gsisio_jax.observer.fixed import Fixed, chosen, fixed
 from gsisio_jax.observer.scan import advance, begin, blank, cut, scan
 from gsisio_jax.observer.types import Carry, StepOutput, cast
@@ -156,8 +156,7 @@ def step(
     Source: design 7.
     """
     box, y_k, u_k, noise, observer = prepare("step", observer, carry.state, y_k, u_k, noise, False, rounding)
-    # A carry of lower precision is widened to that of the data; nothing is lost.
-    return _step(*fixed(observer), cast(carry, box.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))
+    return _step(*fixed(observer), _as(carry, box.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))
 
 
 def resume(
@@ -175,7 +174,12 @@ def resume(
         The carry after the last row, and a `StepOutput` whose arrays have one row per row of `y`.
     """
     box, y, u, noise, observer = prepare("resume", observer, carry.state, y, u, noise, True, rounding)
-    return _resume(*fixed(observer), cast(carry, box.dtype), y, u, noise, check_on_conflict("resume", on_conflict))
+    return _resume(*fixed(observer), _as(carry, box.dtype), y, u, noise, check_on_conflict("resume", on_conflict))
+
+
+def _as(carry: Carry, dtype: Any) -> Carry:
+    """A carry of lower precision, widened to that of the data; nothing is lost."""
+    return carry if carry.state.lower.dtype == dtype else cast(carry, dtype)
 
 
 def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
@@ -189,23 +193,27 @@ def _estimate(
     static: Fixed | None, traced: Any, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool
 ) -> Estimate:
     observer = chosen(static, traced)
+    initial, noise = normal(initial, noise)
     _, out = scan(observer, blank(observer, initial), y, u, noise, hold)
     return _as_estimate(observer, out)
 
 
 @partial(jax.jit, static_argnames=("static", "hold"))
 def _start(static: Fixed | None, traced: Any, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    initial, noise = normal(initial, noise)
     return begin(chosen(static, traced), initial, y, u, noise, hold)
 
 
 @partial(jax.jit, static_argnames=("static", "hold"))
 def _step(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
+    _, noise = normal(carry.state, noise)
     return scalar.call(lambda *args: advance(observer, *args, hold), carry, y, u, noise)
 
 
 @partial(jax.jit, static_argnames=("static", "hold"))
 def _resume(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
+    _, noise = normal(carry.state, noise)
     return scan(chosen(static, traced), carry, y, u, noise, hold)
 
 

@@ -160,15 +160,18 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
             solved = solve_remainder(observer.gains.remainder, right, psi, states, maps.terms)
             domain = domain.intersect(solved, Source.STATE, quiet=rows)
             states = maps.states(domain.box)
-        domain = _open_loop(maps, domain, past, carry, known.terms)
 
-    # 5. The certified bound, where both boxes lie in the region.
+    # 5. d[k-1] from every left inverse, and with it the plant's own equation; then the certified bound, where both
+    # boxes lie in the region.
+    with _stage("inputs"):
+        d, domain = _inputs(maps, domain, states, d_fixed, psi)
+        moved = _moved(maps, past, carry, known.terms)
+        domain = _dynamics(maps, domain, moved, d)
     domain, promised = _certified(maps, domain, past, carry, right, known, left[0], u)
     with _stage("inputs"):
         states = maps.states(domain.box)
-        d, domain = _inputs(maps, domain, states, d_fixed, psi)
         d, domain = _certified_input(maps, domain, states, promised, known, left[1], d)
-        d, domain = _exact_input(maps, domain, past, carry, known.terms, d, lost)
+        d, domain = _exact_input(maps, domain, moved, carry, known.terms, d, lost)
     return domain, alone, d
 
 
@@ -202,17 +205,20 @@ def _predicted(
     return Interval.unchecked((found.lower + known.lower).reshape(shape), (found.upper + known.upper).reshape(shape))
 
 
-def _open_loop(maps: Maps, domain: Domain, past: States, carry: Carry, terms: Terms) -> Domain:
-    """``x = f + B u + G d + w`` in the rows that no input without bounds reaches."""
+def _moved(maps: Maps, past: States, carry: Carry, terms: Terms) -> Interval:
+    """Box (n + l,) of [f + B u + w; g + D u + v - y][k-1]: of what [G; H] d does not explain."""
     n, l = maps.observer.system.n, maps.observer.system.l
-    drift = terms.shift[:n]
-    through = image(maps.observer.system.G, maps.observer.system.input_bounds)
-    if is_concrete(through.lower) and not np.isfinite(through.lower).any():
-        return domain
-    found = maps.rows(np.eye(n, n + l)).bounds(past, carry.h)
-    low = jnp.where(through.lower > -jnp.inf, found.lower + drift.lower + through.lower, -jnp.inf)
-    high = jnp.where(through.upper < jnp.inf, found.upper + drift.upper + through.upper, jnp.inf)
-    return domain.intersect(Interval.unchecked(low, high)[None], Source.DYNAMICS)
+    found = maps.rows(np.eye(n + l)).natural(past, carry.h)
+    return Interval.unchecked(found.lower + terms.shift.lower, found.upper + terms.shift.upper)
+
+
+def _dynamics(maps: Maps, domain: Domain, moved: Interval, d: Interval) -> Domain:
+    """``x = f + B u + G d + w``: no way to a first box, but a contraction of a correct one (paper, Algorithm 1)."""
+    system = maps.observer.system
+    through = plain_image(system.G, widened(d, system.p + 2))
+    moved = widened(moved[: system.n], 2)
+    now = Interval.unchecked(moved.lower + through.lower, moved.upper + through.upper)
+    return domain.intersect(now[None], Source.DYNAMICS)
 
 
 class _Lost:
@@ -350,15 +356,12 @@ def _certified_input(
 
 
 def _exact_input(
-    maps: Maps, domain: Domain, past: States, carry: Carry, terms: Terms, d: Interval, lost: _Lost
+    maps: Maps, domain: Domain, moved: Interval, carry: Carry, terms: Terms, d: Interval, lost: _Lost
 ) -> tuple[Interval, Domain]:
-    """The exact box of d[k-1] for ``[G; H] d`` in the box of ``[x[k]; 0] - [f + B u + w; g + D u + v - y][k-1]``."""
-    n, l = maps.observer.system.n, maps.observer.system.l
-    known = maps.rows(np.eye(n + l)).natural(past, carry.h)
-    known = Interval.unchecked(known.lower + terms.shift.lower, known.upper + terms.shift.upper)
-    zero = jnp.zeros(l, d.dtype)
+    """The exact box of d[k-1] for ``[G; H] d`` in the box of ``[x[k]; 0]`` minus what has moved without it."""
+    zero = jnp.zeros(maps.observer.system.l, d.dtype)
     explained = Interval.unchecked(
-        jnp.concatenate([domain.box.lower, zero]) - known.upper, jnp.concatenate([domain.box.upper, zero]) - known.lower
+        jnp.concatenate([domain.box.lower, zero]) - moved.upper, jnp.concatenate([domain.box.upper, zero]) - moved.lower
     )
     new = _beyond_inverses(maps.observer)
     return exact_input(maps.observer, domain, explained, terms.known, d, lost, carry.believed, new)

@@ -16,7 +16,7 @@ from gsisio_jax.interval import minmax, primitives
 from gsisio_jax.interval.primitives import fusion_barrier
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
 from gsisio_jax.scalar.options import repeated
-from gsisio_jax.scalar.unroll import collected, constants, evaluate
+from gsisio_jax.scalar.unroll import collected, constants, evaluate, typed
 
 # XLA counts these as expensive, and repeats none of them; nor what stays an operation on arrays.
 _ONCE = {
@@ -67,7 +67,7 @@ class ScalarProgram:
             else:
                 value = _bind(number, operands)
                 values[id(number)] = fusion_barrier(value) if id(number) in fenced else value
-        return [jnp.asarray(read(v), dtype) for v, dtype in zip(self._outputs, self._dtypes, strict=True)]
+        return [typed(read(v), dtype) for v, dtype in zip(self._outputs, self._dtypes, strict=True)]
 
     def _fenced(self) -> set[int]:
         """Numbers to be computed once, so that no consumer of a number repeats more than `_REPEATED` operations."""
@@ -79,7 +79,7 @@ class ScalarProgram:
         for number in self.operations:
             own = number.name not in _FREE
             total = own + sum(weight.get(id(v), 0) for v in number.operands)
-            if number.name in _ONCE or not np.issubdtype(number.dtype or np.bool_, np.floating):
+            if number.name in _ONCE or not jnp.issubdtype(number.dtype or np.bool_, jnp.floating):
                 total = 0 if number.name in _ONCE else total
             elif uses[id(number)] > 1 and total >= most and own:
                 fenced.add(id(number))

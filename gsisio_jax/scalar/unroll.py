@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.extend.core as jex
+import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
@@ -25,6 +26,18 @@ _REDUCTIONS = {
     "reduce_sum": ("add", 0), "reduce_prod": ("mul", 1), "reduce_max": ("max", -np.inf), "reduce_min": ("min", np.inf),
     "reduce_and": ("and", True), "reduce_or": ("or", False),
 }  # fmt: skip
+
+
+def plain_dtype(dtype: Any) -> Any:
+    """A NumPy type; that of random keys is none, and stays what it is."""
+    return dtype if jnp.issubdtype(dtype, jax.dtypes.extended) else np.dtype(dtype)
+
+
+def typed(value: Any, dtype: Any) -> Any:
+    """A traced value or a constant, as an array of that type."""
+    return (
+        value if getattr(value, "dtype", None) == dtype and isinstance(value, jax.Array) else jnp.asarray(value, dtype)
+    )
 
 
 def constants(value: Any) -> np.ndarray:
@@ -111,7 +124,7 @@ def _parts(graph: Graph, eqn: Any, args: Sequence[Any]) -> list[Any]:
     whole = graph.make("array", flat, None, ArrayOperation(eqn, [arg.shape for arg in args]), id(eqn))
     out, start = [], 0
     for atom in eqn.outvars:
-        shape, dtype = atom.aval.shape, np.dtype(atom.aval.dtype)
+        shape, dtype = atom.aval.shape, plain_dtype(atom.aval.dtype)
         size = math.prod(shape)
         entries = [graph.make("part", (whole,), dtype, None, start + i) for i in range(size)]
         for i, entry in enumerate(entries):
@@ -129,20 +142,24 @@ class ArrayOperation:
 
     def __call__(self, flat: Sequence[Any]) -> list[Any]:
         """Entries of all results, from the entries of all arguments."""
-        import jax.numpy as jnp
-
         args, start = [], 0
         for shape, atom in zip(self.shapes, self.eqn.invars, strict=True):
             size = math.prod(shape)
-            entries = [jnp.asarray(value, atom.aval.dtype) for value in flat[start : start + size]]
-            args.append(jnp.stack(entries).reshape(shape) if entries else jnp.zeros(shape, atom.aval.dtype))
+            entries = [typed(value, atom.aval.dtype) for value in flat[start : start + size]]
+            args.append(
+                entries[0]
+                if shape == ()
+                else jnp.stack(entries).reshape(shape)
+                if entries
+                else jnp.zeros(shape, atom.aval.dtype)
+            )
             start += size
         return [entry for out in _bound(self.eqn, args) for entry in jnp.ravel(out)]
 
 
 def _entries(graph: Graph, eqn: Any, args: list[Any]) -> np.ndarray:
     name, params, out = eqn.primitive.name, eqn.params, eqn.outvars[0].aval
-    dtype, shape = np.dtype(out.dtype), out.shape
+    dtype, shape = plain_dtype(out.dtype), out.shape
     plain = name in ("convert_element_type", "copy", "stop_gradient") or not params
     key = None if plain else repr(sorted(params.items(), key=str))
     columns = [(arg if arg.shape == shape else np.broadcast_to(arg, shape)).ravel() for arg in args]
@@ -160,7 +177,7 @@ def _entries(graph: Graph, eqn: Any, args: list[Any]) -> np.ndarray:
 
 
 def _reduced(graph: Graph, eqn: Any, name: str, empty: Any, x: np.ndarray) -> np.ndarray:
-    axes, dtype = tuple(eqn.params["axes"]), np.dtype(eqn.outvars[0].aval.dtype)
+    axes, dtype = tuple(eqn.params["axes"]), plain_dtype(eqn.outvars[0].aval.dtype)
     keep = [i for i in range(x.ndim) if i not in axes]
     shape = tuple(x.shape[i] for i in keep)
     rows = np.transpose(x, (*keep, *axes)).reshape(math.prod(shape), math.prod(x.shape[i] for i in axes))
@@ -171,7 +188,7 @@ def _dot(graph: Graph, eqn: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Terms with a constant 0 are left out: gains meet finite numbers in a matrix product."""
     (over_a, over_b), (batch_a, batch_b) = eqn.params["dimension_numbers"]
     out = eqn.outvars[0].aval
-    dtype = np.dtype(out.dtype)
+    dtype = plain_dtype(out.dtype)
 
     def rows(x: np.ndarray, over: Sequence[int], batch: Sequence[int]) -> np.ndarray:
         free = [i for i in range(x.ndim) if i not in (*over, *batch)]

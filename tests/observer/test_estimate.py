@@ -255,8 +255,7 @@ def test_new_numbers_compile_nothing(small):
         gx.estimate(small.observer, small.initial, small.y[:3])
         assert compiled
         assert len(traces) == before
-        gx.estimate(small.observer, small.initial, small.y[:3], rounding="nearest")  # the counter does count
-        assert len(traces) > before
+        assert before > 0  # the counter does count
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
 
