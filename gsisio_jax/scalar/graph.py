@@ -47,11 +47,12 @@ class Graph:
     def make(self, name: str, operands: tuple[Any, ...], dtype: Any, equation: Any = None, key: Any = None) -> Number:
         """The number as it stands, without simplification."""
         names = tuple(id(v) if isinstance(v, Number) else (v.dtype.char, v.tobytes()) for v in operands)
-        found = self._found.get((name, names, key))
+        identity = name, names, key, str(dtype)
+        found = self._found.get(identity)
         if found is None:
             sign = _NONNEGATIVE.get(name)
             nonnegative = sign is not None and sign(*operands)
-            found = self._found[name, names, key] = Number(name, operands, equation, dtype, nonnegative, self.stage)
+            found = self._found[identity] = Number(name, operands, equation, dtype, nonnegative, self.stage)
         return found
 
     def apply(self, name: str, *operands: Any, dtype: Any = None, equation: Any = None, key: Any = None) -> Any:
