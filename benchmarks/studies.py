@@ -11,7 +11,8 @@ import numpy as np
 import gsisio_jax as gx
 from benchmarks.plants import case
 from benchmarks.throughput import AGREEMENT, peak, timed
-from gsisio_jax.observer.step import advance, begin
+from gsisio_jax import scalar
+from gsisio_jax.observer.scan import advance, begin
 
 REDUCTIONS = ("final", "max", "mean")
 PART = 0.05  # of the boxes, for the comparison
@@ -48,8 +49,8 @@ def sweep(boxes: int, levels: int, steps: int) -> dict[str, Any]:
     @jax.vmap
     def bare(box: gx.Interval, noise: gx.Noise) -> Any:
         u = np.zeros(0)
-        carry, _ = begin(arrays, box, y[0], u, noise)
-        carry, _ = jax.lax.scan(lambda c, row: (advance(arrays, c, row, u, noise)[0], None), carry, y[1:])
+        carry, _ = begin(arrays, box, y[0], u, noise, False)
+        carry, _ = scalar.scan(lambda c, row: (advance(arrays, c, row, u, noise, False)[0], None), carry, y[1:])
         return carry.state.width
 
     cases = [np.minimum(np.arange(at, at + tile), part * levels - 1) for at in range(0, part * levels, tile)]
