@@ -29,6 +29,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node
 from gsisio_jax.inclusion.rules.bilinear import multiply
@@ -76,7 +77,7 @@ class AtomBounds(eqx.Module):
         slope: (J, n).
         center, radius: (J,) of the offset: ``|a - slope x - center| <= radius``.
         range: box (J,).
-        value, slip: (J,) the atoms at the center of the box, and what rounding leaves of them; None where not asked for.
+        value, slip: (J,) the atoms at the center of the box, and what rounding leaves of them; None if not asked for.
     """
 
     slope: Any
@@ -494,7 +495,7 @@ def expand(function: Callable[..., Any], n: int, m: int, dtype: Any) -> Expansio
         return None
     graph = Graph()
     inputs = [collected([graph.input(dtype) for _ in range(size)], (size,)) for size in (n, m)]
-    if any(isinstance(const, jax.core.Tracer) for const in closed.consts):
+    if any(isinstance(const, Tracer) for const in closed.consts):
         return None
     (out,) = evaluate(graph, closed.jaxpr, closed.consts, inputs)
     return _Reader(n, inputs, dtype).expansion(out)
@@ -563,9 +564,10 @@ class _Reader:
         if name in _LINEAR:
             return operands[0]
         constant = [v.constant if not v.coefficients else None for v in operands]
-        if name == "mul" and any(c is not None for c in constant):
-            k = 0 if constant[0] is not None else 1
-            return operands[1 - k].times(constant[k])
+        if name == "mul":
+            for factor, other in zip(constant, operands[::-1], strict=True):
+                if factor is not None:
+                    return other.times(factor)
         if name == "div" and constant[1] is not None:
             return operands[0].times(1 / constant[1]) if constant[1] else None
         if name == "div":

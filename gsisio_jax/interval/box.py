@@ -296,8 +296,8 @@ def spread(matrix: Any, reach: Any) -> Any:
 
 
 def slip(matrix: Any, reach: Any) -> Any:
-    """`spread` for matrices of the size of rounding, with less work and a thousandth more (`rounding.generous`); exactly
-    0 for rows of zeros."""
+    """`spread` for matrices of the size of rounding, with less work and a thousandth more (`rounding.generous`);
+    exactly 0 for rows of zeros."""
     found = rounding.generous(add_up(scale(matrix, reach[..., None, :])))
     return jnp.where((matrix != 0).any(-1), found, 0)
 

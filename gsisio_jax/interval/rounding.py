@@ -1,11 +1,12 @@
 """Outward rounding: the error model of the machine, and the few operations that every bound here is widened with.
 
 **Model.** For +, -, *, / and the square root the result on the machine is ``exact (1 + a) + b`` with ``|a| <= 2 u``,
-``|b| <= tiny``: u = eps / 2 is the unit roundoff and tiny the smallest normal number. IEEE arithmetic gives a = u and
-b < tiny. The rest of the room is for what XLA makes of a program: ``x / c`` becomes ``x * (1 / c)`` (a second
-rounding), ``a b + c`` is contracted (one rounding less), constants are reassociated (their sum rounds once), and
-numbers below tiny are flushed to zero, on their way in or out (b). Fast-math and tf32 are outside of this model; no
-matrix product is used, so no precision flag can bring tf32 in. A subnormal constant or measurement counts as zero.
+``|b| <= tiny``: u = eps / 2 is the unit roundoff and tiny the smallest normal number. IEEE arithmetic gives a = u and b
+< tiny. The rest of the room is for what XLA makes of a program: ``x / c`` becomes ``x * (1 / c)`` (a second rounding),
+``a b + c`` is contracted (one rounding less), constants are reassociated (their sum rounds once), and numbers below
+tiny are flushed to zero, on their way in or out (b). Fast-math and tf32 are outside of this model; matrix products ask
+for the full precision of their type (`primitives.matmul`), so no flag brings tf32 in. A subnormal constant or
+measurement counts as zero.
 
 **Widening.** ``down(x) = x - (c |x| + t)`` with ``c = ulps * eps`` and ``t = 4 tiny``: three operations and no
 `nextafter`. For an x that is off by ``2 u |x| + tiny`` (one operation), ``ulps = 2`` proves ``down(x) <= exact``: the

@@ -72,14 +72,14 @@ def contract_affine_rows(states: States, form: Affine, z: Interval) -> tuple[Int
 def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, terms: int) -> Interval:
     """Solve ``x + N_z psi(x) in right`` for x, for every gain.
 
-    With ``psi(x) = D x + [e]``, ``A x in right - N_z [e]`` with ``A = I + N_z D``: one plain linear solve, by the matrix
-    inversion lemma with a q x q inverse. Where that inverse does not verify the contraction is skipped.
+    With ``psi(x) = D x + [e]``, ``A x in right - N_z [e]`` with ``A = I + N_z D``: one plain linear solve, by the
+    matrix inversion lemma with a q x q inverse. Where that inverse does not verify the contraction is skipped.
 
     Rounding. For any matrix M, ``x = M (A x) + (I - M A) x``. With B the computed inverse of ``I + D N_z`` and
     ``M = I - N_z B D``, ``I - M A = N_z (B (I + D N_z) - I) D``. So the bound is off by ``|N_z| E |D| |x|``, E the
-    residual of B, and by what M itself loses in rounding, a few eps of ``|I| + |N_z| |B| |D|``, which meets ``A x``. With
-    ``T = I + |D| |N_z|`` and ``|x| <= m`` both are below ``m + |N_z| (I + |B| T) |D| m`` times eps and the number of
-    operations, and E by as much again where it is computed (q > 1).
+    residual of B, and by what M itself loses in rounding, a few eps of ``|I| + |N_z| |B| |D|``, which meets ``A x``.
+    With ``T = I + |D| |N_z|`` and ``|x| <= m`` both are below ``m + |N_z| (I + |B| T) |D| m`` times eps and the number
+    of operations, and E by as much again where it is computed (q > 1).
 
     Args:
         N_z: (K, n, q).

@@ -22,8 +22,8 @@ class Domain(eqx.Module):
         box: the box (n,), never crossed.
         tolerance: gaps up to this size are no contradiction. The boxes are rounded outward, so a gap is real; but the
             record may itself hold rounded numbers (noise on its bound, zero noise), which miss the plant by as much.
-        gap: the smallest slack of all; below ``-tolerance`` the data contradict the stated bounds. (Apart from the margin,
-            because where nobody asks for the margin it costs nothing.)
+        gap: the smallest slack of all; below ``-tolerance`` the data contradict the stated bounds. (Apart from the
+            margin, which costs nothing where nobody asks for it.)
         margin: signed slack of the first intersection that was empty (its largest gap), else the smallest slack; None
             as long as there was no intersection.
         source: which piece that was, ``Source * SOURCE_STRIDE + index``.

@@ -208,7 +208,7 @@ def _start(static: Fixed | None, traced: Any, initial: Interval, y: Any, u: Any,
 def _step(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
     _, noise = normal(carry.state, noise)
-    return scalar.call(lambda *args: advance(observer, *args, hold), carry, y, u, noise)
+    return scalar.call(lambda c, y, u, noise: advance(observer, c, y, u, noise, hold), carry, y, u, noise)
 
 
 @partial(jax.jit, static_argnames=("static", "hold"))

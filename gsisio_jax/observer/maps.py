@@ -48,8 +48,8 @@ class Maps:
     Attributes:
         observer: with concrete gains, or traced ones.
         dtype: of the data.
-        expansion: None where f and g are bounded over arrays: other methods than the default, large maps, or operations that
-            are no functions of single numbers.
+        expansion: None where f and g are bounded over arrays: other methods than the default, large maps, or operations
+            that are no functions of single numbers.
     """
 
     observer: Observer

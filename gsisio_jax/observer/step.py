@@ -141,7 +141,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
 
     # 4. Sweeps: T2 g on the box so far, every row solved for every state, and (*) solved for x[k].
     with _stage("sweeps"):
-        states, psi = maps.states(domain.box), None
+        states, psi = maps.states(domain.box), Affine(form.slope - observer.C, form.center, form.radius)
         covered = set(observer.first.linear) >= set(range(observer.gains.residual.shape[0]))
         for sweep in range(observer.sweeps):
             rows = None
@@ -377,7 +377,7 @@ def exact_input(
     believed: Any,
     new: Any = True,
 ) -> tuple[Interval, Domain]:
-    """The exact box of d[k-1] for ``[G; H] d in explained`` (paper, Lemma 3; design 4.5), and what it says of conflicts.
+    """The exact box of d[k-1] for ``[G; H] d in explained`` (paper, Lemma 3; design 4.5), and conflicts that it shows.
 
     Args:
         observer: for its rows.

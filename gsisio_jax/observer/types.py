@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion import AffineForm
-from gsisio_jax.inclusion.expansion import AtomBounds
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.rounding import Rounding
@@ -206,7 +205,7 @@ def cast(tree: Any, dtype: Any) -> Any:
     def converted(leaf: Any) -> Any:
         if isinstance(leaf, bounds):
             return leaf.astype(dtype)
-        return jnp.asarray(leaf) if jnp.result_type(leaf) == bool else jnp.asarray(leaf, dtype)
+        return jnp.asarray(leaf) if jnp.issubdtype(jnp.result_type(leaf), jnp.bool_) else jnp.asarray(leaf, dtype)
 
     return jax.tree.map(
         converted,
@@ -229,7 +228,7 @@ class Carry(eqx.Module):
     """
 
     state: Interval
-    h: AtomBounds | AffineForm
+    h: Any  # AtomBounds, or AffineForm in the prediction form
     y: Any
     u: Any
     noise: Noise

@@ -118,7 +118,8 @@ _FOLDED: dict[str, Callable[..., Any]] = {
     "floor": np.floor, "ceil": np.ceil, "sqrt": np.sqrt, "square": np.square, "is_finite": np.isfinite,
     "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal,
     "and": np.bitwise_and, "or": np.bitwise_or, "not": np.invert, "xor": np.bitwise_xor,
-    "select_n": lambda which, *cases: cases[int(which)], **dict.fromkeys(("wave", "falling_wave"), lambda value, t, slope: value),
+    "select_n": lambda which, *cases: cases[int(which)],
+    **dict.fromkeys(("wave", "falling_wave"), lambda value, t, slope: value),
     "clamp": lambda low, x, high: np.minimum(np.maximum(x, low), high),
     "scale": _product, "times": _product,
     **dict.fromkeys(("stop_gradient", "fusion_barrier", "copy", "convert_element_type"), lambda a: a),
@@ -155,7 +156,7 @@ def _mul(graph: Graph, a: Any, b: Any) -> Any:
         if isinstance(x, Number) and x.name == "neg":
             if isinstance(y, Number) and y.name == "neg":
                 return graph.apply("mul", x.operands[0], y.operands[0])
-            if is_constant(y):
+            if not isinstance(y, Number):
                 return graph.apply("mul", x.operands[0], -y)
     return graph.commuting("mul", a, b)
 
@@ -164,8 +165,8 @@ def _safe(name: str) -> Callable[..., Any]:
     def rule(graph: Graph, a: Any, b: Any) -> Any:
         for x, y in ((a, b), (b, a)):
             # A NaN that is passed on as such was never a product of 0 and infinity.
-            if is_constant(x) and np.isfinite(x):
-                return x.dtype.type(0) if x == 0 else graph.apply("mul", x, y)
+            if not isinstance(x, Number) and np.isfinite(x):
+                return x - x if x == 0 else graph.apply("mul", x, y)
         return graph.make(name, (a, b), a.dtype)
 
     return rule

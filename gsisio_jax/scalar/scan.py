@@ -14,8 +14,8 @@ from gsisio_jax.scalar.program import ScalarProgram, scalar_program
 from gsisio_jax.scalar.unroll import numbers_in
 
 MOST_NUMBERS = 60_000
-"""Numbers that a body may compute, arrays unrolled. Beyond, compiling takes longer than running can win back, and matrix
-products over arrays are as fast (`benchmarks/size.py` has the crossover)."""
+"""Numbers that a body may compute, arrays unrolled. Beyond, compiling takes longer than running can win back, and
+matrix products over arrays are as fast."""
 
 
 def scan(
@@ -28,12 +28,12 @@ def scan(
     """``jax.lax.scan``. Packed and unpacked once, at the edge: between steps every number is a 0-d value, which
     `jax.vmap` makes a vector over the batch. `wrap` is applied to the step (`jax.checkpoint`, say)."""
     rows = jax.tree.leaves(xs)
-    length = rows[0].shape[0] if length is None else length
+    turns: int = rows[0].shape[0] if length is None else length
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
     carry = jax.tree.map(jnp.asarray, carry)
     traced = _trace(body, carry, one)
     if traced is None:
-        return jax.lax.scan(wrap(body), carry, xs, length=length)
+        return jax.lax.scan(wrap(body), carry, xs, length=turns)
     program, consts, structure = traced
     flat_carry = jax.tree.leaves(carry)
     count = sum(math.prod(leaf.shape) for leaf in flat_carry)
@@ -44,9 +44,9 @@ def scan(
 
     numbers = tuple(entry for leaf in flat_carry for entry in _entries(leaf, 0))
     columns = tuple(entry for leaf in rows for entry in _entries(leaf, 1))
-    last, kept = jax.lax.scan(wrap(step), numbers, columns, length=length)
+    last, kept = jax.lax.scan(wrap(step), numbers, columns, length=turns)
     leaves = program.results
-    packed = _packed([*last], leaves[: len(flat_carry)], ()) + _packed([*kept], leaves[len(flat_carry) :], (length,))
+    packed = _packed([*last], leaves[: len(flat_carry)], ()) + _packed([*kept], leaves[len(flat_carry) :], (turns,))
     return jax.tree.unflatten(structure, packed)
 
 

@@ -70,7 +70,10 @@ def evaluate(graph: Graph, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any
     values: dict[Any, Any] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*fixed, *args], strict=True))
 
     def read(atom: Any) -> Any:
-        return constants(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, jex.Literal) else values[atom]
+        if not isinstance(atom, jex.Literal):
+            return values[atom]
+        aval: Any = atom.aval
+        return constants(np.asarray(atom.val, aval.dtype))
 
     for eqn in jaxpr.eqns:
         stage = f"{scope}/{eqn.source_info.name_stack}".strip("/")
@@ -86,9 +89,10 @@ def _result(graph: Graph, eqn: Any, args: list[Any], stage: str) -> Sequence[Any
     if name in _MOVES:
         return _MOVES[name](eqn, *args)
     if name in _REDUCTIONS:
-        return [_reduced(graph, eqn, *_REDUCTIONS[name], args[0])]
+        operation, empty = _REDUCTIONS[name]
+        return [_reduced(graph, eqn, operation, empty, args[0])]
     if name == "dot_general":
-        return [_dot(graph, eqn, *args)]
+        return [_dot(graph, eqn, args[0], args[1])]
     if name in _ELEMENTWISE:
         return [_entries(graph, eqn, args)]
     fixed = [known(arg, atom.aval.dtype) for arg, atom in zip(args, eqn.invars, strict=True)]
