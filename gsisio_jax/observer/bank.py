@@ -1,8 +1,8 @@
-"""Linear bounds of x[k] and d[k-1]: what a design's gains and left inverses are, online."""
+"""Linear bounds of x[k] and d[k-1]: what a design's gains and left inverses are, online; what they stand on."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -70,3 +70,18 @@ class Terms(eqx.Module):
     output: Interval
     bounds: Interval
     known: Interval
+
+
+class Known(NamedTuple):
+    """What a step knows without any box of x: shared by all boxes that see the same record and noise.
+
+    Attributes:
+        terms: boxes that enter gains and left inverses linearly.
+        right, inputs: their part of the bounds of x[k], (K, n), and of d[k-1], (K, p).
+        z: box (q,) of T2 (y - D u - v).
+    """
+
+    terms: Terms
+    right: Interval
+    inputs: Interval
+    z: Interval

@@ -43,3 +43,13 @@ def inside(box: Interval, region: Interval) -> Any:
 def in_box(value: Any, box: Interval) -> Any:
     """For a known input: do the design's enclosures of the derivatives hold for it?"""
     return inside(point(value), box)
+
+
+def typed(box: Interval, dtype: Any) -> Interval:
+    """The box in that floating type; its numbers are of that type already, or of no precision."""
+    return Interval.unchecked(jnp.asarray(box.lower, dtype), jnp.asarray(box.upper, dtype))
+
+
+def everything_unless(mask: Any, box: Interval) -> Interval:
+    """The box where the mask holds, else everything."""
+    return choose(mask, box, entire_like(box))

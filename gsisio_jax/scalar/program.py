@@ -94,7 +94,7 @@ class ScalarProgram:
 
 
 def scalar_program(closed: Any, moving: Sequence[bool] = ()) -> ScalarProgram:
-    """The program of a closed jaxpr over arrays; `moving` marks constants that are arguments as well; they come first."""
+    """The program of a closed jaxpr over arrays; `moving` marks constants that are arguments, too."""
     graph = Graph()
 
     def arguments(variables: Sequence[Any]) -> list[np.ndarray]:

@@ -11,7 +11,7 @@ import gsisio_jax as gx
 from gsisio_jax import Interval
 from gsisio_jax.interval.box import image
 from gsisio_jax.observer.domain import Domain
-from gsisio_jax.observer.step import exact_input
+from gsisio_jax.observer.input_boxes import exact_input
 
 
 def plant(input_bounds=None):

@@ -1,0 +1,106 @@
+"""The certified bound: what keeps the width promise of a design, where boxes lie in its region (design 4.3, step 6)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from gsisio_jax.inclusion.expansion import States, wider
+from gsisio_jax.interval.box import Interval, choose, plain_image
+from gsisio_jax.interval.minmax import cut, raised, smaller
+from gsisio_jax.interval.primitives import matmul
+from gsisio_jax.observer.bank import Known
+from gsisio_jax.observer.contractors import centred_form
+from gsisio_jax.observer.domain import Domain
+from gsisio_jax.observer.lost import plainly_wider
+from gsisio_jax.observer.maps import Maps, at_point
+from gsisio_jax.observer.measurement import everything_unless, in_box, inside
+from gsisio_jax.observer.status import Source
+from gsisio_jax.observer.types import Carry
+
+
+class Promised(NamedTuple):
+    """Where the promise of the certificate applies; around the centre of the old box, its radius, and atoms there."""
+
+    applies: Any
+    center: Any
+    slip: Any
+    radius: Any
+    atoms: Any
+
+
+@jax.named_scope("certified")
+def certified(
+    maps: Maps, domain: Domain, past: States, carry: Carry, right: Interval, known: Known, left: Any, u: Any
+) -> tuple[Domain, Promised | None]:
+    """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""
+    observer, certificate, before = maps.observer, maps.observer.certificate, carry.state
+    if not certificate.promised:
+        return domain, None
+    region = certificate.region
+    applies = inside(before, region) & inside(domain.box, region) & carry.believed & ~carry.starts
+    applies = applies & in_box(carry.u, observer.u_region) & in_box(u, observer.u_region)
+    # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
+    c = jnp.where(applies, past.center, jnp.asarray(region.center, right.dtype))
+    radius = jnp.where(applies, past.radius, 0)
+    promised = Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.slip))
+    gains, constants = observer.gains, observer.rounding_constants
+    around = _around(maps, gains.residual[0], constants.growth, promised, known.right[0])
+    around = plainly_wider(around, _first(left))
+    joint, slack = _met(right[0], around)
+    domain = domain.record_margin(jnp.where(applies, slack, jnp.inf), Source.STATE)
+    joint = choose(applies, joint, Interval.unchecked(c, c))
+    safe = choose(applies, domain.box, Interval.unchecked(c, c))
+
+    def psi(x: Any) -> tuple[Any, Any]:
+        return at_point(maps.remainder, x, wider(abs(x), maps.terms), *maps.free_at(x, u))
+
+    box = centred_form(joint, gains.remainder[0], observer.region_inverse, psi, safe, maps.terms)
+    return domain.intersect(everything_unless(applies, box)[None], Source.CERTIFICATE), promised
+
+
+def _met(a: Interval, b: Interval) -> tuple[Interval, Any]:
+    """Intersection and slack; the first box where they miss each other."""
+    lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
+    empty = upper < lower
+    slack = smaller(a.upper - b.lower, b.upper - a.lower)
+    return Interval.unchecked(jnp.where(empty, a.lower, lower), jnp.where(empty, a.upper, upper)), slack
+
+
+def _around(maps: Maps, weights: Any, slope: Any, promised: Promised, known: Interval) -> Interval:
+    """A linear bound without its terms in x[k]: its value at the centre of the old box, give or take ``slope radius``.
+
+    No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
+    """
+    center, radius = at_point(maps.rows(weights), promised.center, promised.slip, *promised.atoms)
+    radius = radius + matmul(jnp.asarray(slope, radius.dtype), promised.radius)
+    radius = radius + wider(abs(center) + radius, 0)
+    return Interval.unchecked(center - radius + known.lower, center + radius + known.upper)
+
+
+def _first(radius: Any) -> Any:
+    return None if radius is None else radius[0]
+
+
+def certified_input(
+    maps: Maps,
+    domain: Domain,
+    states: States,
+    promised: Promised | None,
+    known: Known,
+    left: Any,
+    d: Interval,
+) -> tuple[Interval, Domain]:
+    """The same centred form for d[k-1] with the first left inverse."""
+    observer = maps.observer
+    if promised is None or not observer.system.p:
+        return d, domain
+    inverses, constants = observer.inverses, observer.rounding_constants
+    around = _around(maps, inverses.residual[0], constants.input_growth, promised, known.inputs[0])
+    around = plainly_wider(around, _first(left))
+    now = plain_image(inverses.state[0], states.wide)
+    box = Interval.unchecked(now.lower + around.lower, now.upper + around.upper)
+    met, slack = _met(d, everything_unless(promised.applies, box))
+    return met, domain.record_margin(slack, Source.INPUT)
