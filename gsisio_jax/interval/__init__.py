@@ -1,7 +1,7 @@
 """Boxes and their arithmetic, rounded outward.
 
 `box` has the type, `rounding` the error model behind it, `minmax` a minimum and maximum whose subgradients survive
-rounding, and `xla` keeps XLA from computing a bound more than once.
+rounding, and `primitives` the elementwise operations that JAX sees as one equation each.
 """
 
 from gsisio_jax.interval.box import Interval, hull, intersect, linear_image

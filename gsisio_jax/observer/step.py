@@ -169,9 +169,8 @@ def _predicted(
     n = maps.observer.system.n
     # Rows that use a measurement that is not believed say nothing.
     uses = (rows[:, n:] != 0).any(-1)
-    known = everything_unless(
-        jnp.logical_or(carry.believed, ~uses), Interval.unchecked(known.lower.ravel(), known.upper.ravel())
-    )
+    known = Interval.unchecked(known.lower.ravel(), known.upper.ravel())
+    known = everything_unless(jnp.logical_or(carry.believed, ~uses), known)
     return Interval.unchecked((found.lower + known.lower).reshape(shape), (found.upper + known.upper).reshape(shape))
 
 
@@ -222,6 +221,5 @@ def _current_input(maps: Maps, states: States, h: AtomBounds, output: Interval, 
     weights = xp.concatenate([xp.zeros((current.shape[0], n)), -current], 1)
     found = maps.rows(weights).bounds(states, h)
     seen = plain_image(current, widened(output, output.shape[0]))
-    return everything_unless(
-        believed, nan_to_unbounded(Interval.unchecked(found.lower + seen.lower, found.upper + seen.upper))
-    )
+    now = Interval.unchecked(found.lower + seen.lower, found.upper + seen.upper)
+    return everything_unless(believed, nan_to_unbounded(now))
