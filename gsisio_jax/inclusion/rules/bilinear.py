@@ -55,8 +55,8 @@ def bilinear_line(x: Interval, y: Interval, kappa: float) -> tuple[Any, Any, Any
     the range: ``|x y - (cy x + cx y - cx cy)| <= spread``.
 
     To nearest but for the range, which is padded by kappa more ulps. Centers are numbers like any others; what they
-    leave of the half-widths is an ulp of ``|x|`` and ``|y|`` each: spread is off by 8 ulps of their product, the largest
-    one on the box.
+    leave of the half-widths is an ulp of ``|x|`` and ``|y|`` each: spread is off by 8 ulps of their product, the
+    largest one on the box.
     """
     p, q = times(x.lower, y.lower), times(x.lower, y.upper)
     r, s = times(x.upper, y.lower), times(x.upper, y.upper)

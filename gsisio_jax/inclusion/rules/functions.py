@@ -29,6 +29,7 @@ Source: design 5 and 6.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -121,6 +122,7 @@ SOFTPLUS = Curve(
 )
 
 
+@functools.cache
 def power(p: float) -> Any:
     """``t ** p``: all t for an integer p, t >= 0 otherwise."""
     if p == int(p) and p < 0:
@@ -171,6 +173,7 @@ def power(p: float) -> Any:
     return Curve(phi, slope, lambda s: jnp.exp(_log(s / p) / q))
 
 
+CUBE = power(3.0)
 _SINH = Piece(jnp.sinh, "up", (-INF, INF), reach=_log_max, ulps=16.0, drift=_linear_drift)
 _COSH = Piece(jnp.cosh, "valley", (INF, INF), 1.0, reach=_log_max, ulps=16.0, drift=_linear_drift)
 
@@ -271,11 +274,11 @@ CURVES: dict[str, Any] = {
 }
 
 
-# Lines in closed form ---------------------------------------------------------------------------------------------------
-# The slope s is that of the secant, as in `Curve.line`. It is a number like any other: for a concave phi, ``phi - s t`` is
-# at least what it is at one of the ends, and at most ``g(s)``, its largest value anywhere, wherever rounding has put the
-# point of contact. So a slope that is known badly makes a rest wider, never wrong; where the secant of a narrow interval
-# is badly known, a mean of the derivatives takes its place.
+# Lines in closed form -----------------------------------------------------------------------------------------------
+# The slope s is that of the secant, as in `Curve.line`. It is a number like any other: for a concave phi, ``phi - s t``
+# is at least what it is at one of the ends, and at most ``g(s)``, its largest value anywhere, wherever rounding has put
+# the point of contact. So a slope that is known badly makes a rest wider, never wrong; where the secant of a narrow
+# interval is badly known, a mean of the derivatives takes its place.
 
 
 def _limits(t: Any) -> tuple[float, float]:
@@ -355,8 +358,8 @@ def _log_line(a: Any, b: Any, kappa: float) -> Line:
 
 
 def _reciprocal_line(a: Any, b: Any, kappa: float) -> Line:
-    """``s = -1 / (a b)``; on the right of 0 the rest is ``1 / a + 1 / b`` at both ends and ``2 / sqrt(a b)`` at the point
-    of contact. Quotients are off by an ulp and roots halve that; where they are extreme (reciprocals beyond
+    """``s = -1 / (a b)``; on the right of 0 the rest is ``1 / a + 1 / b`` at both ends and ``2 / sqrt(a b)`` at the
+    point of contact. Quotients are off by an ulp and roots halve that; where they are extreme (reciprocals beyond
     ``tiny^-0.45``, or below its inverse) no line is used, so nothing underflows."""
     tiny = float(jnp.finfo(a.dtype).tiny)
     split, left = ((a < 0) & (b > 0)) | ((a == 0) & (b == 0)), b <= 0
@@ -390,12 +393,72 @@ def _square_line(a: Any, b: Any, kappa: float) -> Line:
     return Line(finite, 2 * m, half - m * m, half, most, natural, 32.0)
 
 
+def _cube_line(a: Any, b: Any, kappa: float) -> Line:
+    """``s = a^2 + a b + b^2``; the rest is ``-a b (a + b)`` at both ends and ``-+2 m^3`` where ``3 m^2 = s``, at m a
+    minimum and at -m a maximum. Ten roundings of numbers that are three times the largest cube at most; where rounding
+    takes m from one side of an end to the other, the value at the end misses that at m by the square of that."""
+    far = float(jnp.finfo(a.dtype).max) ** 0.25
+    usable = (a > -far) & (b < far)
+    p, q = a * a * a, b * b * b
+    natural = Interval.unchecked(
+        rounding.unbounded(rounding.down(p, 6.0 + kappa, 2.0**60), -INF),
+        rounding.unbounded(rounding.up(q, 6.0 + kappa, 2.0**60), INF),
+    )
+    a, b = jnp.where(usable, a, 0), jnp.where(usable, b, 0)
+    both = a * b
+    s = a * a + b * b + both
+    m = jnp.sqrt(jax.lax.stop_gradient(s) * (1 / 3))
+    ends, touch = -(both * (a + b)), m * (m * m - s)
+    low = jnp.where((a <= m) & (m <= b), smaller(ends, touch), ends)
+    high = jnp.where((a <= -m) & (-m <= b), larger(ends, -touch), ends)
+    size = jnp.where(usable, jnp.maximum(abs(p), abs(q)), 0)
+    return Line(usable, s, 0.5 * (high + low), 0.5 * (high - low), size, natural, 64.0)
+
+
+def _bend_line(curve: Curve) -> Callable[[Any, Any, float], Line]:
+    """Of a function that rises from one number to another one and turns at 0, where it is ``center``, as `Curve.line`.
+
+    ``phi - s t`` has a maximum at m and a minimum at -m. s is the derivative at m but for some ulps, so the extremes are
+    off by ``ulps eps s (b - a)`` and the ulps of phi, and by six roundings.
+    """
+    center = 0.5 * (curve.phi.ends[0] + curve.phi.ends[1])
+    ulps = curve.phi.ulps + 4 * curve.slope.ulps + 16
+
+    def line(a: Any, b: Any, kappa: float) -> Line:
+        far = float(jnp.finfo(a.dtype).max) ** 0.25  # values do not change any more from there on
+        usable = (a > -far) & (b < far)
+        a, b = jnp.minimum(jnp.maximum(a, -far), far), jnp.minimum(jnp.maximum(b, -far), far)
+        u, v = curve.phi.fn(a), curve.phi.fn(b)
+        share = curve.phi.ulps + kappa
+        lower, upper = rounding.down(u, share, 2.0**60), rounding.up(v, share, 2.0**60)
+        if curve.phi.ends[0] == 0:
+            lower = jnp.maximum(lower, 0)
+        natural = Interval.unchecked(lower, upper)
+        d = b - a
+        wide = d > 1e-3 * jnp.maximum(abs(a), abs(b))
+        secant = jnp.where(wide, v - u, 1) / jnp.where(wide, d, 1)
+        m = jnp.where(wide, curve.contact(jnp.maximum(secant, 1 / far)), abs(0.5 * (a + b)))
+        s = curve.slope.fn(m)
+        m = jax.lax.stop_gradient(m)
+        touch = jax.lax.stop_gradient(curve.phi.fn(m)) - s * m
+        first, last = u - s * a, v - s * b
+        low, high = smaller(first, last), larger(first, last)
+        low = jnp.where((a <= -m) & (-m <= b), smaller(low, 2 * center - touch), low)
+        high = jnp.where((a <= m) & (m <= b), larger(high, touch), high)
+        size = jnp.maximum(abs(u), abs(v))
+        return Line(usable, s, 0.5 * (high + low), 0.5 * (high - low), size, natural, ulps)
+
+    return line
+
+
 LINES: dict[Any, Callable[[Any, Any, float], Line]] = {
     SQRT: _root_line,
     EXP: _exp_line,
     LOG: _log_line,
     RECIPROCAL: _reciprocal_line,
     SQUARE: _square_line,
+    CUBE: _cube_line,
+    **{CURVES[name]: _bend_line(CURVES[name]) for name in ("atan", "tanh", "logistic")},
 }
 # Where these have no line, on a box that is infinite or misses the domain, they have no bound either.
-UNBOUNDED = (SQRT, LOG, SQUARE)
+UNBOUNDED = (SQRT, LOG, SQUARE, CUBE)
