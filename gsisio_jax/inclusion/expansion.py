@@ -364,7 +364,8 @@ class Expansion:
         lost = jnp.where(line.usable, jax.lax.stop_gradient(t.size), 0) + _crumb(t.size)
         lost = line.size + steep * lost
         pad = _padding(lost, line.ulps + 4 * kappa, line.floor)
-        radius = line.half if t.plain else line.half + steep * t.radius
+        half = line.half if rounding.outward() else jnp.maximum(line.half, 0)
+        radius = half if t.plain else half + scale(steep, t.radius)
         flat = not (t.plain and _is_line(curve) and curve in UNBOUNDED)
         best = not (t.plain and _is_line(curve))
         usable, center, radius, size = _chosen(
@@ -383,7 +384,7 @@ class Expansion:
         pad = _padding(size, 32.0 + 8 * kappa, 2.0**60)
         center, radius = cy * x.center + cx * y.center - cx * cy, spread
         for c, t in ((cy, x), (cx, y)):
-            radius = radius if t.plain else radius + abs(c) * t.radius
+            radius = radius if t.plain else radius + scale(abs(c), t.radius)
         plain = x.plain and y.plain
         usable, center, radius, size = _chosen(usable, center, radius, pad, size, natural, kappa, not plain, not plain)
         cx, cy = jnp.where(usable, cx, 0), jnp.where(usable, cy, 0)

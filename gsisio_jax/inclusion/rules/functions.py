@@ -398,21 +398,21 @@ def _cube_line(a: Any, b: Any, kappa: float) -> Line:
     minimum and at -m a maximum. Ten roundings of numbers that are three times the largest cube at most; where rounding
     takes m from one side of an end to the other, the value at the end misses that at m by the square of that."""
     far = float(jnp.finfo(a.dtype).max) ** 0.25
-    usable = (a > -far) & (b < far)
+    low, high = a > -far, b < far
+    usable = low & high
+    a, b = jnp.minimum(jnp.maximum(a, -far), far), jnp.minimum(jnp.maximum(b, -far), far)
     p, q = a * a * a, b * b * b
     natural = Interval.unchecked(
-        rounding.unbounded(rounding.down(p, 6.0 + kappa, 2.0**60), -INF),
-        rounding.unbounded(rounding.up(q, 6.0 + kappa, 2.0**60), INF),
+        jnp.where(low, rounding.down(p, 6.0 + kappa, 2.0**60), -INF),
+        jnp.where(high, rounding.up(q, 6.0 + kappa, 2.0**60), INF),
     )
-    a, b = jnp.where(usable, a, 0), jnp.where(usable, b, 0)
     both = a * b
     s = a * a + b * b + both
     m = jnp.sqrt(jax.lax.stop_gradient(s) * (1 / 3))
     ends, touch = -(both * (a + b)), m * (m * m - s)
     low = jnp.where((a <= m) & (m <= b), smaller(ends, touch), ends)
     high = jnp.where((a <= -m) & (-m <= b), larger(ends, -touch), ends)
-    size = jnp.where(usable, jnp.maximum(abs(p), abs(q)), 0)
-    return Line(usable, s, 0.5 * (high + low), 0.5 * (high - low), size, natural, 64.0)
+    return Line(usable, s, 0.5 * (high + low), 0.5 * (high - low), jnp.maximum(abs(p), abs(q)), natural, 64.0)
 
 
 def _bend_line(curve: Curve) -> Callable[[Any, Any, float], Line]:
@@ -435,7 +435,7 @@ def _bend_line(curve: Curve) -> Callable[[Any, Any, float], Line]:
             lower = jnp.maximum(lower, 0)
         natural = Interval.unchecked(lower, upper)
         d = b - a
-        wide = d > 1e-3 * jnp.maximum(abs(a), abs(b))
+        wide = d > jnp.maximum(1e-3 * jnp.maximum(abs(a), abs(b)), 1 / far)  # else its derivative overflows
         secant = jnp.where(wide, v - u, 1) / jnp.where(wide, d, 1)
         m = jnp.where(wide, curve.contact(jnp.maximum(secant, 1 / far)), abs(0.5 * (a + b)))
         s = curve.slope.fn(m)

@@ -221,7 +221,9 @@ class Curve:
         m = 0.5 * a + 0.5 * b
         even = self.slope.trend in ("valley", "peak")
         if self.contact is not None:
-            wide = (b - a > _NARROW * jnp.maximum(jnp.abs(a), jnp.abs(b))) & jnp.isfinite(pa) & jnp.isfinite(pb)
+            least = float(jnp.finfo(a.dtype).tiny) ** 0.25  # on shorter ones the derivative of a secant overflows
+            wide = b - a > jnp.maximum(_NARROW * jnp.maximum(jnp.abs(a), jnp.abs(b)), least)
+            wide &= jnp.isfinite(pa) & jnp.isfinite(pb)
             secant = jnp.where(wide, pb - pa, 1.0) / jnp.where(wide, b - a, 1.0)
             # Contacts are powers of the secant: where it is extreme, they or their gradients would overflow.
             largest = float(jnp.finfo(a.dtype).max) ** 0.25
