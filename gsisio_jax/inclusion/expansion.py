@@ -18,10 +18,10 @@ its own. For ranges the same with ``|range_j|`` in the place of q_j. Flushed num
 
 **Atoms of atoms.** An argument t is such a row, too: ``t = s_t x + c_t +- r_t`` with the magnitude
 ``T = sum |w_i| m_i + sum |w_j| q_j + |c|``, and its bounds are off by ``kappa T`` at most. A curve with the line
-``|phi(t) - s t - middle| <= half`` on the range of t (`univariate.Line`), ``|phi| <= size``, has the slope ``s s_t``, the
-center ``s c_t + middle`` and the radius ``|s| r_t + half``, and its q is below ``3 |s| T + size``: one ``kappa |s| T`` for
-the argument and one kappa q for the rows. So radii are widened by ``(ulps + 4 kappa) (size + |s| T)``, with ulps for the
-line. What is flushed to zero in t counts |s| times: T is made ``tiny / eps`` larger, which is more. A product has
+``|phi(t) - s t - middle| <= half`` on the range of t (`univariate.Line`), ``|phi| <= size``, has the slope
+``s s_t``, the center ``s c_t + middle`` and the radius ``|s| r_t + half``, and its q is below ``3 |s| T + size``: one
+``kappa |s| T`` for the argument and one kappa q for the rows. So radii are widened by ``(ulps + 4 kappa) (size + |s|
+T)``, with ulps for the line. What is flushed to zero in t counts |s| times: T is made ``tiny / eps`` larger, which is more. A product has
 ``cy s_x + cx s_y``, ``|cx| <= T_x`` and so on: its q is below ``4 T_x T_y``, and it is widened by
 ``(ulps + 8 kappa) T_x T_y``.
 """
@@ -86,7 +86,8 @@ class AtomBounds(eqx.Module):
         slope: (J, n).
         center, radius: (J,) of the offset: ``|a - slope x - center| <= radius``.
         range: box (J,).
-        value, slip: (J,) the atoms at the center of the box, and what rounding leaves of them; None where not asked for.
+        value, slip: (J,) the atoms at the center of the box, and what rounding leaves of them; None where not asked
+            for.
     """
 
     slope: Any
@@ -454,9 +455,12 @@ class Expansion:
 
 @dataclass
 class _Argument:
-    """A linear argument t: bounds of t, ``|t - slope x - center| <= radius``, and ``sum |slope_i| m_i + |center| +
-    radius <= size``, all valid by themselves. Of the states alone (`plain`): then the weights are known, and what the radius
-    stands for is rounding that a share of the size takes in."""
+    """A linear argument t: its range, ``|t - slope x - center| <= radius``, and ``sum |slope_i| m_i + |center| +
+    radius <= size``.
+
+    Range and form are valid each by itself. Of the states alone (`plain`), the weights are known, and what the radius
+    stands for is rounding that a share of the size takes in.
+    """
 
     range: Interval
     slope: list[Any]
