@@ -15,6 +15,15 @@ products and sums are each off by eps of a term of T, N + 4 times at most for ea
 ``sum |w_i| kappa m_i + sum |w_j| kappa q_j = kappa T`` by itself, whatever its weights are, and needs no error term of
 its own. For ranges the same with ``|range_j|`` in the place of q_j. Flushed numbers lose less than ``2^60 tiny``, see
 `rounding.generous`; that is added to every offset and state.
+
+**Atoms of atoms.** An argument t is such a row, too: ``t = s_t x + c_t +- r_t`` with the magnitude
+``T = sum |w_i| m_i + sum |w_j| q_j + |c|``, and its bounds are off by ``kappa T`` at most. A curve with the line
+``|phi(t) - s t - middle| <= half`` on the range of t (`univariate.Line`), ``|phi| <= size``, has the slope
+``s s_t``, the center ``s c_t + middle`` and the radius ``|s| r_t + half``, and its q is below ``3 |s| T + size``: one
+``kappa |s| T`` for the argument and one kappa q for the rows. So radii are widened by ``(ulps + 4 kappa) (size + |s|
+T)``, with ulps for the line. What is flushed to zero in t counts |s| times: T is made ``tiny / eps`` larger, which is more. A product has
+``cy s_x + cx s_y``, ``|cx| <= T_x`` and so on: its q is below ``4 T_x T_y``, and it is widened by
+``(ulps + 8 kappa) T_x T_y``.
 """
 
 from __future__ import annotations
@@ -32,11 +41,12 @@ import numpy as np
 from jax.core import Tracer
 
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node
-from gsisio_jax.inclusion.rules.bilinear import multiply
-from gsisio_jax.inclusion.rules.functions import CURVES, RECIPROCAL, SQUARE
+from gsisio_jax.inclusion.rules.bilinear import bilinear_line, multiply
+from gsisio_jax.inclusion.rules.functions import CURVES, LINES, RECIPROCAL, SQUARE, UNBOUNDED, power
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE
+from gsisio_jax.inclusion.rules.sincos import LIMIT
 from gsisio_jax.inclusion.rules.trig import Wave, wave_atom, wave_point
-from gsisio_jax.inclusion.rules.univariate import apply
+from gsisio_jax.inclusion.rules.univariate import Line, apply, line_of
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, is_concrete, nan_to_unbounded
 from gsisio_jax.interval.minmax import cut, raised
@@ -252,7 +262,7 @@ class Expansion:
         themselves or by others, may be anything."""
         found: list[_Bounded] = []
         domain = InputBox(states.wide.lower, states.wide.upper, states.magnitude)
-        memo: dict[int, Any] = {}
+        memo: dict[int, _Argument] = {}
         at: list[Any] = []
         thin = _thin(states.center, self.terms)
         for atom, used in zip(self.atoms, self._needed(wanted), strict=True):
@@ -328,25 +338,71 @@ class Expansion:
         return Interval.unchecked(*(jnp.asarray(side, dtype) for side in (lower, upper)))
 
     def _bounded(
-        self, atom: _Atom, states: States, u: Any, found: list[_Bounded], domain: InputBox, memo: dict[int, Any]
+        self, atom: _Atom, states: States, u: Any, found: list[_Bounded], domain: InputBox, memo: dict[int, _Argument]
     ) -> _Bounded:
         if atom.source is not None:
             point = Interval.unchecked(u[atom.source], u[atom.source])
             slip = wider(abs(u[atom.source]), self.terms)
-            zero = np.zeros(self.n, states.center.dtype)
+            zero = [np.zeros((), states.center.dtype)] * self.n
             return _Bounded(zero, point.lower, slip, Interval.unchecked(point.lower - slip, point.upper + slip))
-        curve = CURVES.get(atom.name)
+        curve, moving = _curve(atom), [t for t in atom.arguments if t.coefficients]
         if isinstance(curve, Wave) and self._plain(atom):
             return self._wave(curve, atom.arguments[0], states)
-        nodes = []
-        for t in atom.arguments:
-            if not t.coefficients:
-                nodes.append(_number(t, states.center.dtype))
-                continue
+        for t in moving:
             if id(t) not in memo:
-                memo[id(t)] = self._argument(t, states, found, domain)
-            nodes.append(memo[id(t)])
+                memo[id(t)] = self._argument(t, states, found)
+        if curve is not None and moving:
+            return self._bent(curve, memo[id(moving[0])], states)
+        if atom.name == "mul" and len(moving) == 2:
+            return self._product(*(memo[id(t)] for t in moving), states)
+        nodes = [
+            memo[id(t)].node(domain) if t.coefficients else _number(t, states.center.dtype) for t in atom.arguments
+        ]
         return _from_node(_rule(atom, nodes), states, self.terms)
+
+    def _bent(self, curve: Any, t: _Argument, states: States) -> _Bounded:
+        """A function of one variable, from its line on the range of t."""
+        kappa = 2.0 * self.terms + 16
+        line = _wave_line(curve, t, self.terms) if isinstance(curve, Wave) else None
+        if line is None:
+            a, b = t.range.lower, t.range.upper
+            line = LINES[curve](a, b, kappa) if _is_line(curve) else line_of(curve, a, b, kappa)
+        steep = abs(line.slope)
+        lost = jnp.where(line.usable, jax.lax.stop_gradient(t.size), 0) + _crumb(t.size)
+        lost = line.size + steep * lost
+        pad = _padding(lost, line.ulps + 4 * kappa, line.floor)
+        half = line.half if rounding.outward() else jnp.maximum(line.half, 0)
+        radius = half if t.plain else half + scale(steep, t.radius)
+        flat = not (t.plain and _is_line(curve) and curve in UNBOUNDED)
+        best = not (t.plain and _is_line(curve))
+        usable, center, radius, size = _chosen(
+            line.usable, line.slope * t.center + line.middle, radius, pad, lost, line.range, kappa, flat, best
+        )
+        s = jnp.where(usable, line.slope, 0)
+        slope = [v if _is_zero(v) else s * v for v in t.slope]
+        return _Bounded(slope, center, radius, line.range, size=size)
+
+    def _product(self, x: _Argument, y: _Argument, states: States) -> _Bounded:
+        """``x y`` around both centers."""
+        kappa = 2.0 * self.terms + 16
+        usable, cx, cy, spread, natural = bilinear_line(x.range, y.range, kappa)
+        size_x, size_y = (jnp.where(usable, jax.lax.stop_gradient(t.size), 0) + _crumb(t.size) for t in (x, y))
+        size = size_x * size_y
+        pad = _padding(size, 32.0 + 8 * kappa, 2.0**60)
+        center, radius = cy * x.center + cx * y.center - cx * cy, spread
+        for c, t in ((cy, x), (cx, y)):
+            radius = radius if t.plain else radius + scale(abs(c), t.radius)
+        plain = x.plain and y.plain
+        usable, center, radius, size = _chosen(usable, center, radius, pad, size, natural, kappa, not plain, not plain)
+        cx, cy = jnp.where(usable, cx, 0), jnp.where(usable, cy, 0)
+        slope = []
+        for v, w in zip(x.slope, y.slope, strict=True):
+            terms = [c * part for c, part in ((cy, v), (cx, w)) if not _is_zero(part)]
+            slope.append(sum(terms[1:], terms[0]) if terms else np.zeros((), states.center.dtype))
+        if any(not (_is_zero(v) or _is_zero(w)) for v, w in zip(x.slope, y.slope, strict=True)):
+            # Both depend on the same entry of x: their product is then better known than that of their ranges.
+            natural = _met(natural, slope, center, radius, states)
+        return _Bounded(slope, center, radius, natural, size=size)
 
     def _wave(self, curve: Wave, t: Linear, states: States) -> _Bounded:
         """Sine or cosine of a linear function of the states."""
@@ -360,7 +416,7 @@ class Expansion:
         slope: list[Any] = [np.zeros((), dtype)] * self.n
         for k, weight in t.coefficients.items():
             slope[k] = steepness * kind(weight)
-        return _Bounded(jnp.stack(slope), center, radius, natural, middle)
+        return _Bounded(slope, center, radius, natural, middle, _wave_size(curve, size))
 
     def _at(self, t: Linear, x: Any, magnitude: Any) -> tuple[Any, Any]:
         """A linear function of the states at a point, and the magnitude of its terms."""
@@ -372,35 +428,144 @@ class Expansion:
             size = size + kind(abs(float(weight))) * magnitude[k]
         return jnp.asarray(value), jnp.asarray(size)
 
-    def _argument(self, t: Linear, states: States, found: list[_Bounded], domain: InputBox) -> Node:
-        """A linear argument as a node: a range met with what slopes say, and its form."""
+    def _argument(self, t: Linear, states: States, found: list[_Bounded]) -> _Argument:
+        """A linear argument: a range met with what slopes say, its form, and the magnitude of its terms."""
         dtype = states.center.dtype
         kind = np.dtype(dtype).type
         natural = self._argument_range(t, states.wide, [bounded.range for bounded in found])
         inner = {k - self.n: v for k, v in t.coefficients.items() if k >= self.n}
-        slope = np.zeros(self.n, dtype)
+        slope: list[Any] = [np.zeros((), dtype)] * self.n
         slip: Any = kind(0)
+        size: Any = kind(abs(float(t.constant)))
         for k, value in t.coefficients.items():
+            weight = kind(abs(float(value)))
+            size = size + weight * (states.magnitude[k] if k < self.n else found[k - self.n].reach(states))
             if k < self.n:
-                slope[k] = kind(value)
+                slope[k] = np.asarray(value, dtype)
                 inexact = value != Fraction(float(slope[k])) or len(t.coefficients) > 1 or inner
-                slip = slip + kind(abs(float(value))) * states.slip[k] if inexact and rounding.outward() else slip
+                slip = slip + weight * states.slip[k] if inexact and rounding.outward() else slip
         center: Any = kind(t.constant)
         radius: Any = slip + abs(center) * kind(16 * float(jnp.finfo(dtype).eps) * rounding.outward())
-        moving: Any = slope
         for j, value in inner.items():
             weight = kind(value)
-            moving = moving + weight * found[j].slope
+            for k, part in enumerate(found[j].slope):
+                if not _is_zero(part):
+                    slope[k] = weight * part if _is_zero(slope[k]) else slope[k] + weight * part
             center, radius = center + weight * found[j].center, radius + abs(weight) * found[j].radius
-        if not inner:
-            offset = Interval.unchecked(jnp.asarray(center - radius), jnp.asarray(center + radius))
-            return Node(natural, Form(slope, offset, domain))
-        middle = matmul(moving, states.center) + center
-        spread = scale(abs(moving), states.radius).sum() + radius
-        ranges = Interval.unchecked(raised(natural.lower, middle - spread), cut(natural.upper, middle + spread))
-        met = choose(ranges.lower <= ranges.upper, ranges, natural)
-        offset = nan_to_unbounded(Interval.unchecked(center - radius, center + radius))
-        return Node(nan_to_unbounded(met), Form(moving, offset, domain))
+        if len(t.coefficients) > 1 and inner:
+            natural = _met(natural, slope, center, radius, states)
+        elif len(t.coefficients) > 1 or t.coefficients.get(next(iter(t.coefficients))) != 1 or t.constant:
+            natural = nan_to_unbounded(natural)
+        return _Argument(natural, slope, center, radius, jnp.asarray(size), not inner)
+
+
+@dataclass
+class _Argument:
+    """A linear argument t: its range, ``|t - slope x - center| <= radius``, and ``sum |slope_i| m_i + |center| +
+    radius <= size``.
+
+    Range and form are valid each by itself. Of the states alone (`plain`), the weights are known, and what the radius
+    stands for is rounding that a share of the size takes in.
+    """
+
+    range: Interval
+    slope: list[Any]
+    center: Any
+    radius: Any
+    size: Any
+    plain: bool
+
+    def node(self, domain: InputBox) -> Node:
+        """For the rules of the engine over arrays."""
+        center, radius = self.center, self.radius
+        offset = Interval.unchecked(jnp.asarray(center - radius), jnp.asarray(center + radius))
+        slope: Any = np.asarray(self.slope) if self.plain else _joined(self.slope, domain.lower.dtype)
+        return Node(self.range, Form(slope, offset if self.plain else nan_to_unbounded(offset), domain))
+
+
+def _is_zero(value: Any) -> bool:
+    """Known to be 0 while tracing."""
+    return isinstance(value, np.ndarray | np.generic) and not value.any()
+
+
+def _is_line(curve: Any) -> bool:
+    return curve in LINES
+
+
+def _crumb(size: Any) -> Any:
+    """For what is flushed to zero, see the module docstring."""
+    info = jnp.finfo(size.dtype)
+    return np.dtype(size.dtype).type(float(info.tiny) / float(info.eps))
+
+
+def _padding(size: Any, ulps: Any, floor: float) -> Any:
+    if not rounding.outward():
+        return np.zeros((), size.dtype)
+    return rounding.error(size, ulps, floor)
+
+
+def _chosen(
+    usable: Any, center: Any, radius: Any, pad: Any, size: Any, natural: Interval, kappa: float, flat: bool, best: bool
+) -> tuple[Any, Any, Any, Any]:
+    """Is a form used, its center and radius and 4 times its `size`; else those of the range, as a form of slope 0.
+
+    Args:
+        flat: the range may be finite where no form is usable.
+        best: it may be narrower than the form; where it is not by more than rounding, the slope is kept.
+    """
+    usable = usable & (size < float(jnp.finfo(size.dtype).max) / 64)
+    lower, upper = natural.lower, natural.upper
+    far = jnp.maximum(abs(lower), abs(upper))
+    middle, half = np.zeros((), size.dtype), np.asarray(np.inf, size.dtype)
+    if flat:
+        half = 0.5 * upper - 0.5 * lower
+        middle = jnp.where(half < jnp.inf, 0.5 * lower + 0.5 * upper, 0)
+        # Its own rounding, and rows of it.
+        half = half + _padding(far, 2 * kappa + 8, 2.0**60)
+        if best:
+            usable = usable & (radius <= half + pad)
+    center, radius = jnp.where(usable, center, middle), jnp.where(usable, radius + pad, half)
+    return usable, center, radius, jnp.where(usable, 4 * size, 2 * far)
+
+
+def _met(natural: Interval, slope: list[Any], center: Any, radius: Any, states: States) -> Interval:
+    """A range met with the image of a form; the range itself where rounding makes the two miss each other."""
+    middle, spread = center, radius
+    for k, part in enumerate(slope):
+        if not _is_zero(part):
+            middle, spread = middle + part * states.center[k], spread + scale(abs(part), states.radius[k])
+    met = Interval.unchecked(raised(natural.lower, middle - spread), cut(natural.upper, middle + spread))
+    return nan_to_unbounded(choose(met.lower <= met.upper, met, natural))
+
+
+def _wave_size(curve: Wave, size: Any) -> Any:
+    """The q of a sine or cosine (`wave_atom`), of which nothing but its range is used beyond `LIMIT`."""
+    size = jax.lax.stop_gradient(size)
+    return 3 * jnp.minimum(size + np.dtype(size.dtype).type(curve.cosine), LIMIT[size.dtype.name])
+
+
+def _wave_line(curve: Wave, t: _Argument, terms: int) -> Line:
+    """A sine or cosine as a `Line` of an argument that is not linear in the states."""
+    a, b = t.range.lower, t.range.upper
+    m, r = 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
+    size = jnp.where(jnp.isfinite(t.size), t.size, jnp.inf)
+    slope, center, radius, natural, _ = wave_atom(curve.cosine, m, r, size, terms)
+    usable = size < LIMIT[m.dtype.name]
+    return Line(usable, slope, center, radius, _wave_size(curve, size), natural)
+
+
+def _curve(atom: _Atom) -> Any:
+    """The function of one variable that an atom is, None for others."""
+    if atom.name == "reciprocal":
+        return RECIPROCAL
+    if atom.name == "mul":
+        return SQUARE if atom.arguments[0] is atom.arguments[1] else None
+    if atom.name == "integer_pow" and atom.equation.params["y"] not in (0, 1):
+        return power(float(atom.equation.params["y"]))
+    if atom.name == "pow" and not atom.arguments[1].coefficients and atom.arguments[0].coefficients:
+        exponent = float(atom.arguments[1].constant)
+        return power(exponent) if exponent not in (0.0, 1.0) else None
+    return CURVES.get(atom.name)
 
 
 @dataclass
@@ -410,6 +575,17 @@ class _Bounded:
     radius: Any
     range: Interval
     value: Any = None
+    size: Any = None
+
+    def reach(self, states: States) -> Any:
+        """The q of an atom, at least its range: ``sum |slope_i| m_i + |center| + radius``."""
+        if self.size is None:
+            size = jnp.maximum(abs(self.range.lower), abs(self.range.upper))
+            form = abs(self.center) + self.radius
+            for k, part in enumerate(self.slope):
+                form = form if _is_zero(part) else form + scale(abs(part), states.magnitude[k])
+            self.size = jnp.maximum(size, form)
+        return jax.lax.stop_gradient(self.size)
 
 
 def _thin(x: Any, terms: int) -> Interval:
@@ -434,7 +610,7 @@ def _values(found: list[Any], dtype: Any) -> tuple[Any, Any]:
 
 def _nothing(n: int, states: States) -> _Bounded:
     zero = np.zeros((), states.center.dtype)
-    return _Bounded(np.zeros(n, zero.dtype), zero, zero, Interval.unchecked(zero, zero))
+    return _Bounded([zero] * n, zero, zero, Interval.unchecked(zero, zero))
 
 
 def _stacked(found: list[_Bounded], at: list[Any], states: States) -> AtomBounds:
@@ -445,11 +621,15 @@ def _stacked(found: list[_Bounded], at: list[Any], states: States) -> AtomBounds
         return AtomBounds(jnp.zeros((0, n), dtype), none, none, Interval.unchecked(none, none), value, slip)
 
     def joined(parts: list[Any]) -> Any:
-        return jnp.stack([jnp.asarray(part, dtype) for part in parts])
+        return _joined(parts, dtype)
 
     natural = Interval.unchecked(joined([b.range.lower for b in found]), joined([b.range.upper for b in found]))
     slope, center, radius = ([getattr(b, name) for b in found] for name in ("slope", "center", "radius"))
-    return AtomBounds(joined(slope), joined(center), joined(radius), natural, value, slip)
+    return AtomBounds(joined([joined(part) for part in slope]), joined(center), joined(radius), natural, value, slip)
+
+
+def _joined(parts: list[Any], dtype: Any) -> Any:
+    return jnp.stack([jnp.asarray(part, dtype) for part in parts])
 
 
 def widened(slope: Any, offset: Interval, natural: Interval, states: States, terms: int) -> AtomBounds:
@@ -466,13 +646,15 @@ def widened(slope: Any, offset: Interval, natural: Interval, states: States, ter
 
 def _from_node(node: Node, states: States, terms: int) -> _Bounded:
     natural = nan_to_unbounded(node.range)
+    n, dtype = len(states.center), states.center.dtype
     if node.form is None:
-        slope: Any = np.zeros(len(states.center), states.center.dtype)
+        slope: Any = np.zeros(n, dtype)
         offset = natural
     else:
         slope, offset = node.form.slope, nan_to_unbounded(node.form.folded())
     found = widened(slope, offset, natural, states, terms)
-    return _Bounded(found.slope, found.center, found.radius, found.range)
+    parts = [np.asarray(slope[k]) if isinstance(slope, np.ndarray) else slope[k] for k in range(n)]
+    return _Bounded(parts, found.center, found.radius, found.range)
 
 
 def _number(t: Linear, dtype: Any) -> Any:

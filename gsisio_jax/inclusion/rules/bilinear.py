@@ -24,6 +24,7 @@ from gsisio_jax.inclusion.rules.linear import add, move, multiple, structural, t
 from gsisio_jax.inclusion.rules.univariate import apply, extremes
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, is_concrete
+from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import moderate, times
 
 
@@ -47,6 +48,28 @@ def multiply(x: Any, y: Any) -> Node:
         form = _envelope(x, y, cx, cy, spread, natural, box)
     node = Node(natural, form, join(chain(y.range, x.jac), chain(x.range, y.jac)))
     return meet(node) if x.form is not None and y.form is not None else node
+
+
+def bilinear_line(x: Interval, y: Interval, kappa: float) -> tuple[Any, Any, Any, Any, Interval]:
+    """What `expansion` makes of a product: is there a line, the centers cx and cy, the product of the half-widths, and
+    the range: ``|x y - (cy x + cx y - cx cy)| <= spread``.
+
+    To nearest but for the range, which is padded by kappa more ulps. Centers are numbers like any others; what they
+    leave of the half-widths is an ulp of ``|x|`` and ``|y|`` each: spread is off by 8 ulps of their product, the
+    largest one on the box.
+    """
+    p, q = times(x.lower, y.lower), times(x.lower, y.upper)
+    r, s = times(x.upper, y.lower), times(x.upper, y.upper)
+    lower, upper = smaller(smaller(p, q), smaller(r, s)), larger(larger(p, q), larger(r, s))
+    lower, upper = (
+        rounding.unbounded(move(side, 2.0 + kappa, 2.0**60), end)
+        for side, move, end in ((lower, rounding.down, -jnp.inf), (upper, rounding.up, jnp.inf))
+    )
+    largest = float(jnp.finfo(p.dtype).max) / 8
+    usable = (x.lower > -largest) & (x.upper < largest) & (y.lower > -largest) & (y.upper < largest)
+    cx, rx = (jnp.where(usable, 0.5 * (x.upper + side), 0) for side in (x.lower, -x.lower))
+    cy, ry = (jnp.where(usable, 0.5 * (y.upper + side), 0) for side in (y.lower, -y.lower))
+    return usable, cx, cy, rx * ry, Interval.unchecked(lower, upper)
 
 
 def _radius(a: Interval, center: Any) -> Any:

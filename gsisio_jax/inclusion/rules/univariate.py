@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -221,7 +221,9 @@ class Curve:
         m = 0.5 * a + 0.5 * b
         even = self.slope.trend in ("valley", "peak")
         if self.contact is not None:
-            wide = (b - a > _NARROW * jnp.maximum(jnp.abs(a), jnp.abs(b))) & jnp.isfinite(pa) & jnp.isfinite(pb)
+            least = float(jnp.finfo(a.dtype).tiny) ** 0.25  # on shorter ones the derivative of a secant overflows
+            wide = b - a > jnp.maximum(_NARROW * jnp.maximum(jnp.abs(a), jnp.abs(b)), least)
+            wide &= jnp.isfinite(pa) & jnp.isfinite(pb)
             secant = jnp.where(wide, pb - pa, 1.0) / jnp.where(wide, b - a, 1.0)
             # Contacts are powers of the secant: where it is extreme, they or their gradients would overflow.
             largest = float(jnp.finfo(a.dtype).max) ** 0.25
@@ -393,3 +395,45 @@ class Hinge:
             rest = Interval.unchecked(rest.lower - loss, rest.upper + loss)
         both = bent & ~low & ~high
         return jnp.where(both, 0, s), choose(both, natural, rest)
+
+
+class Line(NamedTuple):
+    """What a function does on an interval, for `expansion`: ``|phi(t) - slope t - middle| <= half``, up to rounding.
+
+    Attributes:
+        usable: the line says something; all its numbers are finite anyway, and so are their gradients.
+        slope, middle, half: the line, to nearest. Off by at most ``ulps eps (size + |slope| |t|) + floor tiny``.
+        size: at least ``|phi|`` where the line is usable.
+        range: bounds of phi, rounded outward.
+        ulps, floor: known while tracing.
+    """
+
+    usable: Any
+    slope: Any
+    middle: Any
+    half: Any
+    size: Any
+    range: Interval
+    ulps: Any = 16.0
+    floor: float = 2.0**60
+
+
+def line_of(curve: Any, a: Any, b: Any, kappa: float) -> Line:
+    """The line of any function of this module; its rest is padded already. Ranges are padded by kappa more ulps.
+
+    Middle and half-width of the rest are rounded twice each, relative to its sides, which are ``size + |slope| |t|`` at
+    most.
+    """
+    if getattr(curve, "steep", False):
+        a, b = _calm(a), _calm(b)
+    natural = guard(curve.range(a, b))
+    s, rest = curve.line(a, b, natural)
+    usable = (rest.lower > -INF) & (rest.upper < INF)
+    low, high = jnp.where(usable, rest.lower, 0), jnp.where(usable, rest.upper, 0)
+    # phi = s t + rest is no larger than the rest and s t together, which is what this bound is used with.
+    size = jnp.maximum(abs(low), abs(high))
+    natural = Interval.unchecked(
+        rounding.down(natural.lower, kappa, 2.0**60), rounding.up(natural.upper, kappa, 2.0**60)
+    )
+    natural = Interval.unchecked(rounding.unbounded(natural.lower, -INF), rounding.unbounded(natural.upper, INF))
+    return Line(usable, s, 0.5 * low + 0.5 * high, 0.5 * high - 0.5 * low, size, natural, 4.0)
