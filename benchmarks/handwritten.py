@@ -1,7 +1,7 @@
-"""A step of the paper's example (S1) written by hand over single numbers: its gains are constants (`handwritten_design.json`).
+"""A step of the paper's example (S1) written by hand over single numbers, gains (handwritten_design.json) constants.
 
-The contractors of `estimate` with its default design, rounded outward in float64. Without missing rows, state bounds or a
-proof of its error bounds: it is there to be compared with.
+Contractors are those of `estimate` with its default design, rounded outward in float64. Without missing rows, state
+bounds or a proof of its error bounds: it is there to be compared with.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Bounds for the handwritten step: a box is a pair of 0-d values, and a linear image has one error bound, not one an operation."""
+"""Bounds for the handwritten step: a box is a pair of 0-d values, and a linear image has one error bound."""
 
 from __future__ import annotations
 

@@ -71,6 +71,7 @@ def _measure(kind: str, batch: int, steps: int, against: str | None) -> dict[str
         if against:
             programs["older"].close()
     ours = widths["ours"]
+    means = {name: (found if found.ndim == 2 else found[:, -1]).mean(0) for name, found in widths.items()}
     rates = {name: batch * steps / min(times) for name, times in seconds.items()}
     result = {
         "batch": batch,
@@ -82,7 +83,7 @@ def _measure(kind: str, batch: int, steps: int, against: str | None) -> dict[str
         "rates": rates,
         "ratios": {name: rates["ours"] / rate for name, rate in rates.items() if name != "ours"},
         "left_out": {"C": reason} if reason else {},
-        "mean_width": {name: found.mean(0).tolist() for name, found in widths.items()},
+        "mean_width": {name: mean.tolist() for name, mean in means.items()},
         "same_on_threads": programs["ours"].same(),
     }
     good = [np.isfinite(ours).all(), result["same_on_threads"]]
@@ -90,7 +91,7 @@ def _measure(kind: str, batch: int, steps: int, against: str | None) -> dict[str
         result["gap"] = float(np.abs(widths["C"] - ours).max() / ours.max())
         good.append(result["gap"] < AGREEMENT)
     if "older" in widths:
-        result["wider_than_older"] = (ours.mean(0) / widths["older"].mean(0) - 1).tolist()
+        result["wider_than_older"] = (means["ours"] / means["older"] - 1).tolist()
         good.append(max(result["wider_than_older"]) <= WIDER)
     return {**result, "ok": bool(all(good))}
 
@@ -102,21 +103,21 @@ class _Program:
         compile_seconds: that the tile took.
     """
 
-    def __init__(self, batch: int, tile: Callable[[slice], Any], last: Callable[[Any], Any], compile_seconds: float):
-        """`last` takes the widths of the last step, (boxes, n), from what a tile returns."""
+    def __init__(self, batch: int, tile: Callable[[slice], Any], widths: Callable[[Any], Any], compile_seconds: float):
+        """`widths` takes those of the last step, (boxes, n), or of all, from what a tile returns."""
         size = min(TILE, batch)
         if batch % size or size % 8:
             raise ValueError(f"benchmarks: {batch} boxes are no multiple of {size}")
         self._tiles = [slice(start, start + size) for start in range(0, batch, size)]
-        self._tile, self._last, self.compile_seconds = tile, last, compile_seconds
+        self._tile, self._widths, self.compile_seconds = tile, widths, compile_seconds
 
     def run(self, threads: int = THREADS) -> list[Any]:
         with ThreadPoolExecutor(threads) as pool:
             return list(pool.map(self._tile, self._tiles))
 
     def widths(self) -> np.ndarray:
-        """Of the last step; warms up."""
-        return np.concatenate([np.asarray(self._last(found)) for found in self.run()])
+        """Of the last step, or of all; warms up."""
+        return np.concatenate([np.asarray(self._widths(found)) for found in self.run()])
 
     def timed(self) -> float:
         started = time.perf_counter()
@@ -129,7 +130,7 @@ class _Program:
         return all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True))
 
 
-def _compiled(kind: str, function: Callable[..., Any], lower: Any, upper: Any, y: Any, last: Any) -> _Program:
+def _compiled(kind: str, function: Callable[..., Any], lower: Any, upper: Any, y: Any, widths: Any) -> _Program:
     size = min(TILE, len(lower))
     started = time.perf_counter()
     program = jax.jit(function).lower(lower[:size], upper[:size], y).compile(compiler_options=cpu_options())
@@ -138,7 +139,7 @@ def _compiled(kind: str, function: Callable[..., Any], lower: Any, upper: Any, y
     def tile(boxes: slice) -> Any:
         return jax.block_until_ready(program(lower[boxes], upper[boxes], y))
 
-    return _Program(len(lower), tile, last if kind == "all boxes" else lambda found: found, seconds)
+    return _Program(len(lower), tile, widths if kind == "all boxes" else lambda found: found, seconds)
 
 
 def _ours(kind: str, observer: gx.Observer, lower: Any, upper: Any, y: Any) -> _Program:
@@ -146,14 +147,14 @@ def _ours(kind: str, observer: gx.Observer, lower: Any, upper: Any, y: Any) -> _
         found = gx.estimate(observer, gx.Interval(lower, upper), y)
         return found.state.width[-1] if kind == "final widths" else (found.state, found.input, found.status)
 
-    return _compiled(kind, jax.vmap(one, (0, 0, None)), lower, upper, y, lambda found: found[0].width[:, -1])
+    return _compiled(kind, jax.vmap(one, (0, 0, None)), lower, upper, y, lambda found: found[0].width)
 
 
 def _handwritten(kind: str, lower: Any, upper: Any, y: Any) -> _Program:
     def boxes(lower: Any, upper: Any, y: Any) -> Any:
         return handwritten.run(lower.T, upper.T, y, kind == "final widths")
 
-    return _compiled(kind, boxes, lower, upper, y, lambda found: np.stack([b[1][-1] - b[0][-1] for b in found[0]], 1))
+    return _compiled(kind, boxes, lower, upper, y, lambda found: np.stack([(b[1] - b[0]).T for b in found[0]], -1))
 
 
 def _c_program(kind: str, observer: gx.Observer, plant: Any, lower: Any, upper: Any, y: Any, folder: Path) -> _Program:
@@ -172,8 +173,12 @@ def _c_program(kind: str, observer: gx.Observer, plant: Any, lower: Any, upper: 
     def tile(boxes: slice) -> Any:
         return compiled([*lower[boxes].T, *upper[boxes].T, *entries[4:]], y)
 
-    # The carry begins with the box of x: lower sides, then upper ones.
-    return _Program(len(lower), tile, lambda found: (found[0][2:4] - found[0][:2]).T, compiled.seconds)
+    def widths(found: Any) -> Any:
+        """The carry, and what is kept, begin with the box of x: lower sides, then upper ones."""
+        own, kept = found
+        return (kept[:, 2:4] - kept[:, :2]).transpose(2, 0, 1) if everything else (own[2:4] - own[:2]).T
+
+    return _Program(len(lower), tile, widths, compiled.seconds)
 
 
 class _Older:

@@ -232,7 +232,7 @@ def _select(graph: Graph, which: Any, *cases: Any) -> Any:
     if all(map(is_constant, cases)) and all(case.tobytes() == first.tobytes() for case in cases[1:]):
         return first
     if len(cases) == 2 and which.name == "not":
-        return graph.apply("select_n", which.operands[0], cases[1], first)
+        return graph.apply("select_n", which.operands[0], cases[1], first, dtype=first.dtype)
     if len(cases) == 2 and first.dtype == bool and all(map(is_constant, cases)):
         return graph.apply("not", which) if first else which
     return None
