@@ -13,9 +13,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+# As the command line of the library sets them, unless the user has; before JAX is imported.
+XLA_FLAGS = "--xla_cpu_prefer_vector_width=512 --xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
 RESULTS = Path(__file__).resolve().parent / "results"
 SIZES = {  # full, quick
     "compiled": ({"batch": 100_000, "steps": 100}, {"batch": 5_000, "steps": 50}),
+    "limit": ({"batch": 100_000, "steps": 100}, {"batch": 4_000, "steps": 50}),
+    "limit stored": ({"batch": 20_000, "steps": 100}, {"batch": 4_000, "steps": 50}),
     "numpy": ({"batch": 2_000, "steps": 100}, {"batch": 1_000, "steps": 20}),
     "tanks": ({"steps": 100}, {"steps": 50}),
     "study": ({"boxes": 1000, "levels": 1000, "steps": 100}, {"boxes": 100, "levels": 100, "steps": 50}),
@@ -23,13 +27,15 @@ SIZES = {  # full, quick
 }
 
 
-def cases(quick: bool) -> dict[str, tuple[str, str, dict[str, Any]]]:
+def cases(quick: bool, against: str | None = None) -> dict[str, tuple[str, str, dict[str, Any]]]:
     """Name of every case: its module, its function and its arguments."""
     size = {name: both[quick] for name, both in SIZES.items()}
     return {
         "throughput final widths": ("throughput", "final_widths", size["compiled"]),
         "throughput all boxes": ("throughput", "all_boxes", size["compiled"]),
         "throughput NumPy": ("throughput", "numpy", size["numpy"]),
+        "limit final widths": ("limit", "final_widths", {**size["limit"], "against": against}),
+        "limit all boxes": ("limit", "all_boxes", {**size["limit stored"], "against": against}),
         "study sweep": ("studies", "sweep", size["study"]),
         **{
             f"rounding {plant} {dtype}": ("rounding", "compare", {"plant": plant, "dtype": dtype, **size["rounding"]})
@@ -46,15 +52,16 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="small sizes")
     parser.add_argument("--only", default="", help="cases whose name contains this text")
     parser.add_argument("--name", help="name of the result file (default: quick or full)")
+    parser.add_argument("--against", metavar="PYTHON", help="of an environment with an older version (limit)")
     parser.add_argument("--case", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    chosen = {name: spec for name, spec in cases(options.quick).items() if options.only in name}
+    chosen = {name: spec for name, spec in cases(options.quick, options.against).items() if options.only in name}
     if options.case:
         print(json.dumps(run_here(*chosen[options.case])))
         return 0
     if not chosen:
         parser.error(f"no case contains {options.only!r}; there are: {', '.join(cases(options.quick))}")
-    results = {name: run_apart(name, options.quick) for name in chosen}
+    results = {name: run_apart(name, options.quick, options.against) for name in chosen}
     print(table(results))
     name = options.name or ("quick" if options.quick else "full")
     RESULTS.mkdir(exist_ok=True)
@@ -72,13 +79,13 @@ def run_here(module: str, function: str, arguments: dict[str, Any]) -> dict[str,
     return measure(**arguments)
 
 
-def run_apart(name: str, quick: bool) -> dict[str, Any]:
+def run_apart(name: str, quick: bool, against: str | None = None) -> dict[str, Any]:
     """Run one case in a process of its own."""
     print(f"{name} ...", file=sys.stderr, flush=True)
     command = [sys.executable, "-m", "benchmarks", "--case", name, *(["--quick"] if quick else [])]
-    done = subprocess.run(
-        command, capture_output=True, text=True, cwd=RESULTS.parent.parent, env={**os.environ, "JAX_ENABLE_X64": "1"}
-    )
+    command += ["--against", against] if against else []
+    environment = {"XLA_FLAGS": XLA_FLAGS, **os.environ, "JAX_ENABLE_X64": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=RESULTS.parent.parent, env=environment)
     if done.returncode:
         print(done.stderr, file=sys.stderr)
         return {"ok": False, "error": _last_error(done.stderr)}
@@ -127,6 +134,8 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         notes += [f"{r['to_bare']:.2f} of the rate of the bare kernel"] if "to_bare" in r else []
         notes += [f"outward / nearest {r['cost']:.2f}, wider by {r['inflation']:.1e}"] if "cost" in r else []
         notes += [f"design {r['design_seconds']:.1f} s"] if "design_seconds" in r else []
+        notes += [f"ours / {other} {ratio:.2f}" for other, ratio in r.get("ratios", {}).items()]
+        notes += [f"{other} left out: {reason}" for other, reason in r.get("left_out", {}).items()]
         left = f"{name:<26}{size:>16}{run:>10}{cpu:>10}{build:>10}{rate:>14}"
         lines.append(f"{left}{ratio:>9}{peak:>11}  {', '.join(notes)}")
     return "\n".join([*lines, "", "rate in million boxes x steps per second; NumPy's is that of the smaller batch."])

@@ -21,13 +21,15 @@ class Number:
         equation: the primitive with its parameters, None for those without any.
         nonnegative: known to be 0 or more (or NaN).
         stage: the innermost `jax.named_scope` it was first needed in.
+        order: of the numbers of a graph, set when it is made.
     """
 
-    __slots__ = ("dtype", "equation", "name", "nonnegative", "operands", "stage")
+    __slots__ = ("dtype", "equation", "name", "nonnegative", "operands", "order", "stage")
 
     def __init__(self, name: str, operands: tuple[Any, ...], equation: Any, dtype: Any, nonnegative: bool, stage: str):
         self.name, self.operands, self.equation = name, operands, equation
         self.dtype, self.nonnegative, self.stage = dtype, nonnegative, stage
+        self.order = 0
 
 
 def is_constant(value: Any) -> bool:
@@ -39,10 +41,17 @@ class Graph:
 
     def __init__(self) -> None:
         self._found: dict[Any, Number] = {}
+        self._made = 0
         self.stage = ""
 
     def input(self, dtype: Any) -> Number:
-        return Number("input", (), None, dtype, False, "")
+        return self._ordered(Number("input", (), None, dtype, False, ""))
+
+    def _ordered(self, number: Number) -> Number:
+        """Addresses would do to tell two numbers apart, but not to make the same program again."""
+        self._made += 1
+        number.order = self._made
+        return number
 
     def make(self, name: str, operands: tuple[Any, ...], dtype: Any, equation: Any = None, key: Any = None) -> Number:
         """The number as it stands, without simplification."""
@@ -52,7 +61,8 @@ class Graph:
         if found is None:
             sign = _NONNEGATIVE.get(name)
             nonnegative = sign is not None and sign(*operands)
-            found = self._found[identity] = Number(name, operands, equation, dtype, nonnegative, self.stage)
+            found = self._ordered(Number(name, operands, equation, dtype, nonnegative, self.stage))
+            self._found[identity] = found
         return found
 
     def apply(self, name: str, *operands: Any, dtype: Any = None, equation: Any = None, key: Any = None) -> Any:
@@ -67,7 +77,7 @@ class Graph:
 
     def commuting(self, name: str, a: Any, b: Any) -> Number:
         """The same number for both orders of its operands; a constant comes last."""
-        if is_constant(a) or (isinstance(b, Number) and id(b) < id(a)):
+        if is_constant(a) or (isinstance(b, Number) and b.order < a.order):
             a, b = b, a
         return self.make(name, (a, b), np.dtype(bool) if name == "eq" else a.dtype)
 
@@ -224,7 +234,7 @@ def _select(graph: Graph, which: Any, *cases: Any) -> Any:
     if all(map(is_constant, cases)) and all(case.tobytes() == first.tobytes() for case in cases[1:]):
         return first
     if len(cases) == 2 and which.name == "not":
-        return graph.apply("select_n", which.operands[0], cases[1], first)
+        return graph.apply("select_n", which.operands[0], cases[1], first, dtype=first.dtype)
     if len(cases) == 2 and first.dtype == bool and all(map(is_constant, cases)):
         return graph.apply("not", which) if first else which
     return None

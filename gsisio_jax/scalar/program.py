@@ -39,20 +39,22 @@ class ScalarProgram:
     """A function of single numbers.
 
     Attributes:
+        inputs: entries of all arguments, array by array.
+        outputs: entries of all results, numbers and constants.
         operations: the numbers that the results need, in order.
         results: shapes and types of the arrays that the function over arrays returned.
     """
 
     def __init__(self, inputs: list[np.ndarray], outputs: list[np.ndarray], dtypes: Sequence[Any]):
-        self._inputs = [value for array in inputs for value in array.ravel()]
-        self._outputs = [value for array in outputs for value in array.ravel()]
+        self.inputs = [value for array in inputs for value in array.ravel()]
+        self.outputs = [value for array in outputs for value in array.ravel()]
         self.results = [jax.ShapeDtypeStruct(a.shape, dtype) for a, dtype in zip(outputs, dtypes, strict=True)]
         self._dtypes = [dtype for array, dtype in zip(outputs, dtypes, strict=True) for _ in range(array.size)]
-        self.operations = _needed(self._outputs)
+        self.operations = _needed(self.outputs)
 
     def __call__(self, args: Sequence[Any]) -> list[Any]:
         """Trace on 0-d values: entries of all results from entries of all arguments, array by array."""
-        values: dict[int, Any] = {id(number): arg for number, arg in zip(self._inputs, args, strict=True)}
+        values: dict[int, Any] = {id(number): arg for number, arg in zip(self.inputs, args, strict=True)}
 
         def read(value: Any) -> Any:
             return values[id(value)] if isinstance(value, Number) else value
@@ -65,14 +67,15 @@ class ScalarProgram:
             elif number.name == "array":
                 values[id(number)] = number.equation(operands)
             else:
-                value = _bind(number, operands)
+                with jax.named_scope(stage_of(number)):
+                    value = _bind(number, operands)
                 values[id(number)] = fusion_barrier(value) if id(number) in fenced else value
-        return [typed(read(v), dtype) for v, dtype in zip(self._outputs, self._dtypes, strict=True)]
+        return [typed(read(v), dtype) for v, dtype in zip(self.outputs, self._dtypes, strict=True)]
 
     def _fenced(self) -> set[int]:
         """Numbers to be computed once, so that no consumer of a number repeats more than `_REPEATED` operations."""
         uses: Counter[int] = Counter(id(v) for number in self.operations for v in number.operands)
-        uses.update(id(v) for v in self._outputs)
+        uses.update(id(v) for v in self.outputs)
         most = repeated()
         weight: dict[int, int] = {}
         fenced = set()
@@ -90,7 +93,12 @@ class ScalarProgram:
     def count(self, stages: bool = False) -> Counter[str]:
         """Operations by primitive, or by the outermost `jax.named_scope`."""
         real = [v for v in self.operations if v.name not in _FREE]
-        return Counter(v.stage.split("/")[0] if stages else v.name for v in real)
+        return Counter(stage_of(v) if stages else v.name for v in real)
+
+
+def stage_of(number: Number) -> str:
+    """The outermost `jax.named_scope` that a number was first needed in; "other" outside of all."""
+    return number.stage.split("/")[0] or "other"
 
 
 def scalar_program(closed: Any, moving: Sequence[bool] = ()) -> ScalarProgram:
