@@ -95,11 +95,10 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
     """The box of x[k], the box that y[k] and the state bounds alone give, and the box of d[k-1]."""
     observer, system, constants = maps.observer, maps.observer.system, maps.observer.rounding_constants
     known, before, bounds = _known(observer, carry, y, u, noise), carry.state, system.state_bounds
-    size = largest_magnitude(y, carry.y, before.lower, before.upper)
-
     # 1. Bounds of h = [f; g] on the old box were left by the last step. 2. The right side of (*) without psi, jointly.
     with _stage("predict"):
         past = maps.states(before)
+        size = largest_magnitude(y, carry.y, past.magnitude)
         right = _predicted(maps, observer.gains, past, carry, known.right)
         d_fixed = _predicted(maps, observer.inverses, past, carry, known.inputs, ranges=False)
 
@@ -199,7 +198,7 @@ def _finish(
     bits = (
         (conflict, Status.CONFLICT),
         (~jnp.isfinite(y).all(), Status.MISSING),
-        (~(jnp.isfinite(state.lower) & jnp.isfinite(state.upper)).all(), Status.UNBOUNDED),
+        (~(states.radius < jnp.inf).all(), Status.UNBOUNDED),
         (~applies, Status.OUTSIDE_REGION),
     )
     after = Carry(state, h, y, u, noise, jnp.asarray(False), believed)

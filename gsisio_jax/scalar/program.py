@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 import jax
@@ -60,16 +61,12 @@ class ScalarProgram:
             return values[id(value)] if isinstance(value, Number) else value
 
         fenced = self._fenced()
-        for number in self.operations:
-            operands = [read(value) for value in number.operands]
-            if number.name == "part":
-                values[id(number)] = operands[0][number.equation]
-            elif number.name == "array":
-                values[id(number)] = number.equation(operands)
-            else:
-                with jax.named_scope(stage_of(number)):
+        for stage, numbers in groupby(self.operations, stage_of):
+            with jax.named_scope(stage):
+                for number in numbers:
+                    operands = [read(value) for value in number.operands]
                     value = _bind(number, operands)
-                values[id(number)] = fusion_barrier(value) if id(number) in fenced else value
+                    values[id(number)] = fusion_barrier(value) if id(number) in fenced else value
         return [typed(read(v), dtype) for v, dtype in zip(self.outputs, self._dtypes, strict=True)]
 
     def _fenced(self) -> set[int]:
@@ -138,6 +135,10 @@ def _needed(outputs: Sequence[Any]) -> list[Number]:
 
 
 def _bind(number: Number, operands: list[Any]) -> Any:
+    if number.name == "part":
+        return operands[0][number.equation]
+    if number.name == "array":
+        return number.equation(operands)
     plain = _PLAIN.get(number.name)
     if plain is not None:
         return plain(*operands)

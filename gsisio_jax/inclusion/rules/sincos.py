@@ -99,9 +99,11 @@ def _sin_cos(t: Any) -> tuple[Any, Any]:
     for part in _PARTS[_name(t)]:
         y = y - k * kind(part)
     sine, cosine = map(fusion_barrier, _polynomials(y))
-    # k mod 4 in floating point: k is small.
-    quarter = k - 4 * jnp.floor(k * kind(0.25))
-    odd = (quarter == 1) | (quarter == 3)
+    # k mod 4 in floating point, in quarters: k is small.
+    quarter = k * kind(0.25)
+    quarter = quarter - jnp.floor(quarter)
+    odd = (quarter == 0.25) | (quarter == 0.75)
     first, second = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)
-    sine, cosine = jnp.where(quarter >= 2, -first, first), jnp.where((quarter == 1) | (quarter == 2), -second, second)
+    sine = jnp.where(quarter >= 0.5, -first, first)
+    cosine = jnp.where((quarter == 0.25) | (quarter == 0.5), -second, second)
     return fusion_barrier(sine), fusion_barrier(cosine)

@@ -135,14 +135,17 @@ def wave_atom(cosine: bool, m: Any, r: Any, size: Any, terms: int) -> tuple[Any,
     (sine, other), (half_sin, half_cos) = sin_cos(m), half_sin_cos(r)
     value, steepness = (other, -sine) if cosine else (sine, other)
     pad: Any = kind(0)
+    everything = kind(1)
     if rounding.outward():
-        size = jax.lax.stop_gradient(jnp.where(usable, size, 0)) + kind(cosine)
-        pad = rounding.error(size, 8 * SLOT + 3 * (2 * terms + 16), 2.0**60)
-    slope, steep, turned = steepness * half_cos, abs(steepness), 1 - 2 * half_sin * half_sin
+        ulps = 8 * SLOT + 3 * (2 * terms + 16)
+        pad = rounding.error(jax.lax.stop_gradient(size) + kind(cosine), ulps, 2.0**60)
+        everything = kind(1 + ulps * float(jnp.finfo(m.dtype).eps))
+    square = half_sin * half_sin
+    slope, steep, turned, bent = steepness * half_cos, abs(steepness), 1 - 2 * square, value * square
     odd = steep * larger(half_sin - 0.5 * r * half_cos, half_cos * (r - 2 * half_sin))
     even = value * turned
-    center = 0.5 * (value + even) - slope * m
-    radius = 0.5 * abs(value - even) + odd + pad
+    center = value - bent - slope * m  # halfway between value and even, which are 2 bent apart
+    radius = abs(bent) + odd + pad
     reach = 2 * steep * half_sin * half_cos + pad
     limit = turned - pad
     lower = jnp.where(usable & (-value < limit), even - reach, -1)
@@ -150,7 +153,7 @@ def wave_atom(cosine: bool, m: Any, r: Any, size: Any, terms: int) -> tuple[Any,
     natural = Interval.unchecked(larger(lower, -1), smaller(upper, 1))
     middle = jnp.where(usable, value, 0), jnp.where(usable, pad, 1)
     slope, center = jnp.where(usable, slope, 0), jnp.where(usable, center, 0)
-    return slope, center, jnp.where(usable, radius, kind(1) + pad), natural, middle
+    return slope, center, jnp.where(usable, radius, everything), natural, middle
 
 
 def wave_point(cosine: bool, t: Any, size: Any, terms: int) -> tuple[Any, Any]:
