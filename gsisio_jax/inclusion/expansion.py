@@ -7,14 +7,7 @@ the constant weights ``R L`` and ``R A``: what cancels cancels exactly, and cost
 On a box every atom has a slope and an offset, ``a - s . x in offset``, and a range. Bounds of a combination are the
 linear part plus those of the atoms, slopes combined before the box is applied (`joint`), or ranges alone (`natural`).
 
-**Rounding.** Let a row have N terms in all (states, atoms, a constant) and T = sum |L_i| m_i + sum |A_j| q_j, where
-``m_i >= |x_i|`` and ``q_j = sum_i |s_ji| m_i + |offset_j|``. Slopes combined, weights rounded once from fractions,
-products and sums are each off by eps of a term of T, N + 4 times at most for each of two levels: in all less than
-``(2 N + 12) eps T``, plus what is flushed to zero. So every offset is made wider by ``kappa q_j`` and every state by
-``kappa m_i``, with ``kappa = (2 N + 16) eps``, ONCE for a box: a row of weights w then takes in
-``sum |w_i| kappa m_i + sum |w_j| kappa q_j = kappa T`` by itself, whatever its weights are, and needs no error term of
-its own. For ranges the same with ``|range_j|`` in the place of q_j. Flushed numbers lose less than ``2^60 tiny``, see
-`rounding.generous`; that is added to every offset and state.
+Rounding: see `atoms`.
 
 **Atoms of atoms.** An argument t is such a row, too: ``t = s_t x + c_t +- r_t`` with the magnitude
 ``T = sum |w_i| m_i + sum |w_j| q_j + |c|``, and its bounds are off by ``kappa T`` at most. A curve with the line
@@ -28,18 +21,17 @@ more. A product has ``cy s_x + cx s_y``, ``|cx| <= T_x`` and so on: its q is bel
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
+from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, widened, wider
+from gsisio_jax.inclusion.linear_parts import Atom, Linear
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node
 from gsisio_jax.inclusion.rules.bilinear import bilinear_line, multiply
 from gsisio_jax.inclusion.rules.functions import CURVES, LINES, RECIPROCAL, SQUARE, UNBOUNDED, power
@@ -48,162 +40,9 @@ from gsisio_jax.inclusion.rules.sincos import LIMIT
 from gsisio_jax.inclusion.rules.trig import Wave, wave_atom, wave_point
 from gsisio_jax.inclusion.rules.univariate import Line, apply, line_of
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, is_concrete, nan_to_unbounded
+from gsisio_jax.interval.box import Interval, choose, faint, is_concrete, nan_to_unbounded
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
-from gsisio_jax.scalar.graph import Graph, Number, is_constant
-from gsisio_jax.scalar.unroll import collected, evaluate, numbers_in
-
-_MOST_OPERATIONS = 400  # of f and g together; beyond, bounds come from the engine over arrays
-FLUSHED = 2.0**60  # in smallest normal numbers
-
-
-class States(eqx.Module):
-    """The box of x as atoms and rows use it: center, radius, `slip` = kappa m, and both sides widened by it.
-
-    Every field has shape (n,); a radius may be infinite, a center never is.
-    """
-
-    center: Any
-    radius: Any
-    magnitude: Any
-    slip: Any
-    wide: Interval
-
-    @classmethod
-    def of(cls, box: Interval, terms: int) -> States:
-        box = Interval.unchecked(jnp.asarray(box.lower), jnp.asarray(box.upper))
-        radius = 0.5 * (box.upper - box.lower)
-        center = jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0)
-        magnitude = abs(center) + radius
-        slip = wider(magnitude, terms)
-        return cls(center, radius + slip, magnitude, slip, Interval.unchecked(box.lower - slip, box.upper + slip))
-
-
-class AtomBounds(eqx.Module):
-    """Bounds of J atoms on a box, widened so that linear images need no more rounding (module docstring).
-
-    Attributes:
-        slope: (J, n).
-        center, radius: (J,) of the offset: ``|a - slope x - center| <= radius``.
-        range: box (J,).
-        value, slip: (J,) the atoms at the center of the box, and what rounding leaves of them; None if not asked for.
-    """
-
-    slope: Any
-    center: Any
-    radius: Any
-    range: Interval
-    value: Any = None
-    slip: Any = None
-
-
-def wider(size: Any, terms: int) -> Any:
-    """kappa times `size`, for rows of up to so many terms; a constant for gradients. 0 to nearest."""
-    if not rounding.outward():
-        return jnp.zeros_like(size)
-    info = jnp.finfo(size.dtype)
-    kind = np.dtype(size.dtype).type
-    kappa, floor = kind((2 * terms + 16) * float(info.eps)), kind(FLUSHED * float(info.tiny))
-    return jax.lax.stop_gradient(size) * kappa + floor
-
-
-def of_constant(constant: Any) -> Any:
-    """What a constant of a row is off by; nothing where it is 0."""
-    size = jnp.asarray(abs(constant))
-    return jnp.where(size == 0, 0, wider(size, 0))
-
-
-class Rows(eqx.Module):
-    """Linear combinations ``states x + atoms a(x) + constant``: weights (r, n), (r, J) and (r,).
-
-    `lost` holds the sums of magnitudes that the weights were made of, (r, n) and (r, J), where they are not known while
-    tracing: what cancels in them is then rounded at the size of its parts. None where they were rounded once.
-    """
-
-    states: Any
-    atoms: Any
-    constant: Any
-    lost: Any = None
-
-    def joint(self, states: States, atoms: AtomBounds) -> tuple[Any, Any]:
-        """Center and radius (r,), slopes combined before the box is applied."""
-        slope = self.slope(atoms)
-        center = matmul(slope, states.center) + matmul(self.atoms, atoms.center) + self.constant
-        radius = scale(abs(slope), states.radius).sum(-1) + scale(abs(self.atoms), atoms.radius).sum(-1)
-        return center, radius + self.slip(states, atoms)
-
-    def slip(self, states: States, atoms: AtomBounds) -> Any:
-        """What the slopes of the states, the constant, and weights that were rounded are off by, (r,)."""
-        slip = scale(abs(self.states), states.slip).sum(-1) + of_constant(self.constant)
-        if self.lost is None or not rounding.outward():
-            return slip
-        far = jnp.maximum(abs(atoms.range.lower), abs(atoms.range.upper))
-        size = scale(abs(atoms.slope), states.magnitude).sum(-1) + abs(atoms.center) + atoms.radius
-        size = jnp.maximum(size, jnp.where(jnp.isfinite(far), far, 0))
-        of_states, of_atoms = self.lost
-        return slip + wider(
-            scale(of_states, states.magnitude).sum(-1) + scale(of_atoms, size).sum(-1), self.atoms.shape[-1]
-        )
-
-    def joint_box(self, states: States, atoms: AtomBounds) -> Interval:
-        """The same as a box (r,)."""
-        center, radius = self.joint(states, atoms)
-        return Interval.unchecked(center - radius, center + radius)
-
-    def slope(self, atoms: AtomBounds) -> Any:
-        """(r, n), up to rounding that `AtomBounds` has taken in."""
-        return self.states + matmul(self.atoms, atoms.slope)
-
-    def natural(self, states: States, atoms: AtomBounds) -> Interval:
-        """Box (r,) from ranges alone."""
-        weights = jnp.concatenate([jnp.asarray(self.states), jnp.asarray(self.atoms)], -1)
-        lower = jnp.concatenate([states.wide.lower, atoms.range.lower])
-        upper = jnp.concatenate([states.wide.upper, atoms.range.upper])
-        low, high = _sides(weights, lower, upper)
-        slip = of_constant(self.constant) if self.lost is None else self.slip(states, atoms)
-        return Interval.unchecked(low + (self.constant - slip), high + (self.constant + slip))
-
-    def bounds(self, states: States, atoms: AtomBounds) -> Interval:
-        """The intersection of both, box (r,)."""
-        joint, natural = self.joint_box(states, atoms), self.natural(states, atoms)
-        return Interval.unchecked(raised(natural.lower, joint.lower), cut(natural.upper, joint.upper))
-
-
-def _sides(weights: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
-    """Both sides of the image of a box that has been widened beforehand."""
-    up = weights >= 0
-    low = scale(weights, jnp.where(up, lower, upper)).sum(-1)
-    return low, scale(weights, jnp.where(up, upper, lower)).sum(-1)
-
-
-@dataclass
-class Linear:
-    """``sum coefficients[k] variable_k + constant``: variables 0..n-1 are states, the others atoms."""
-
-    coefficients: dict[int, Fraction] = field(default_factory=dict)
-    constant: Fraction = Fraction(0)
-
-    def plus(self, other: Linear, sign: int = 1) -> Linear:
-        merged = dict(self.coefficients)
-        for k, value in other.coefficients.items():
-            merged[k] = merged.get(k, Fraction(0)) + sign * value
-        return Linear({k: v for k, v in merged.items() if v}, self.constant + sign * other.constant)
-
-    def times(self, factor: Fraction) -> Linear:
-        if not factor:
-            return Linear()
-        return Linear({k: factor * v for k, v in self.coefficients.items()}, factor * self.constant)
-
-
-@dataclass
-class _Atom:
-    """An operation that is not linear: its primitive and arguments; or the entry `source` of the known input."""
-
-    name: str
-    equation: Any
-    arguments: tuple[Linear, ...]
-    source: int | None = None
 
 
 @dataclass
@@ -217,7 +56,7 @@ class Expansion:
     """
 
     n: int
-    atoms: list[_Atom]
+    atoms: list[Atom]
     outputs: list[Linear]
 
     @property
@@ -281,7 +120,7 @@ class Expansion:
             found.append(self._value(atom, x, thin, u, found) if used else Interval.unchecked(zero, zero))
         return _values(found, x.dtype)
 
-    def _value(self, atom: _Atom, x: Any, thin: Interval, u: Any, found: Sequence[Any]) -> Any:
+    def _value(self, atom: Atom, x: Any, thin: Interval, u: Any, found: Sequence[Any]) -> Any:
         """An atom at a point, as (value, radius), or on a thin box around it, as a box; widened for rows."""
         curve = CURVES.get(atom.name)
         if isinstance(curve, Wave) and self._plain(atom):
@@ -302,7 +141,7 @@ class Expansion:
         extra = wider(jnp.maximum(abs(value.lower), abs(value.upper)), self.terms)
         return Interval.unchecked(value.lower - extra, value.upper + extra)
 
-    def _plain(self, atom: _Atom) -> bool:
+    def _plain(self, atom: Atom) -> bool:
         """Its argument is a linear function of the states."""
         return all(k < self.n for k in atom.arguments[0].coefficients)
 
@@ -335,10 +174,12 @@ class Expansion:
             side = wide[k] if k < self.n else found[k - self.n]
             first, last = (side.lower, side.upper) if value > 0 else (side.upper, side.lower)
             lower, upper = lower + weight * first, upper + weight * last
+        floor = faint(np.array([kind(value) for value in t.coefficients.values()], dtype))
+        lower, upper = lower - floor, upper + floor
         return Interval.unchecked(*(jnp.asarray(side, dtype) for side in (lower, upper)))
 
     def _bounded(
-        self, atom: _Atom, states: States, u: Any, found: list[_Bounded], domain: InputBox, memo: dict[int, _Argument]
+        self, atom: Atom, states: States, u: Any, found: list[_Bounded], domain: InputBox, memo: dict[int, _Argument]
     ) -> _Bounded:
         if atom.source is not None:
             point = Interval.unchecked(u[atom.source], u[atom.source])
@@ -554,7 +395,7 @@ def _wave_line(curve: Wave, t: _Argument, terms: int) -> Line:
     return Line(usable, slope, center, radius, _wave_size(curve, size), natural)
 
 
-def _curve(atom: _Atom) -> Any:
+def _curve(atom: Atom) -> Any:
     """The function of one variable that an atom is, None for others."""
     if atom.name == "reciprocal":
         return RECIPROCAL
@@ -632,18 +473,6 @@ def _joined(parts: list[Any], dtype: Any) -> Any:
     return jnp.stack([jnp.asarray(part, dtype) for part in parts])
 
 
-def widened(slope: Any, offset: Interval, natural: Interval, states: States, terms: int) -> AtomBounds:
-    """Bounds of any functions as atoms: affine forms (J, n), (J,) and ranges, each valid by itself."""
-    center, radius = offset.center, offset.radius
-    size = scale(abs(slope), states.magnitude).sum(-1) + abs(center) + radius
-    far = jnp.maximum(abs(natural.lower), abs(natural.upper))
-    slip = wider(jnp.where(jnp.isfinite(far), far, 0), terms)
-    # The radius of an interval is itself rounded.
-    radius = radius + wider(jnp.where(jnp.isfinite(size), size, 0), terms)
-    radius = jnp.where(jnp.isfinite(size), radius, jnp.inf)
-    return AtomBounds(slope, center, radius, Interval.unchecked(natural.lower - slip, natural.upper + slip))
-
-
 def _from_node(node: Node, states: States, terms: int) -> _Bounded:
     natural = nan_to_unbounded(node.range)
     n, dtype = len(states.center), states.center.dtype
@@ -661,104 +490,9 @@ def _number(t: Linear, dtype: Any) -> Any:
     return np.asarray(float(t.constant), dtype)
 
 
-def _rule(atom: _Atom, nodes: list[Any]) -> Node:
+def _rule(atom: Atom, nodes: list[Any]) -> Node:
     if atom.name == "reciprocal":
         return apply(RECIPROCAL, nodes[0])
     if atom.name == "mul":
         return apply(SQUARE, nodes[0]) if atom.arguments[0] is atom.arguments[1] else multiply(*nodes)
     return ELEMENTWISE[atom.name](atom.equation, *nodes)
-
-
-def expand(function: Callable[..., Any], n: int, m: int, dtype: Any) -> Expansion | None:
-    """The expansion of ``function(x, u)``, x (n,) and u (m,); None where it is too large, or holds operations (loops,
-    comparisons, library calls) that the engine over arrays knows better."""
-    closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype))
-    if numbers_in(closed.jaxpr) > 4 * _MOST_OPERATIONS or len(closed.out_avals) != 1:
-        return None
-    graph = Graph()
-    inputs = [collected([graph.input(dtype) for _ in range(size)], (size,)) for size in (n, m)]
-    if any(isinstance(const, Tracer) for const in closed.consts):
-        return None
-    (out,) = evaluate(graph, closed.jaxpr, closed.consts, inputs)
-    return _Reader(n, inputs, dtype).expansion(out)
-
-
-_LINEAR = {"add", "sub", "neg", "copy", "stop_gradient", "convert_element_type"}
-_KNOWN = {"mul", "div", "integer_pow", "square", "pow", "atan2", "max", "min", "abs", *CURVES}
-
-
-class _Reader:
-    """Reads numbers into linear combinations of atoms."""
-
-    def __init__(self, n: int, inputs: list[np.ndarray], dtype: Any):
-        self.n, self.atoms, self.dtype = n, [], np.dtype(dtype)
-        self.read: dict[int, Linear] = {id(x): Linear({i: Fraction(1)}) for i, x in enumerate(inputs[0])}
-        for j, u in enumerate(inputs[1]):
-            self.read[id(u)] = self._atom(_Atom("input", None, (), j))
-
-    def expansion(self, outputs: np.ndarray) -> Expansion | None:
-        found = []
-        for value in outputs:
-            linear = self.linear(value)
-            if linear is None:
-                return None
-            found.append(linear)
-        return Expansion(self.n, self.atoms, found) if len(self.atoms) <= _MOST_OPERATIONS else None
-
-    def _atom(self, atom: _Atom) -> Linear:
-        self.atoms.append(atom)
-        return Linear({self.n + len(self.atoms) - 1: Fraction(1)})
-
-    def linear(self, value: Any) -> Linear | None:
-        """A number as a linear combination; None where some operation behind it is not known here."""
-        if is_constant(value):
-            number = float(value)
-            return Linear({}, Fraction(number)) if math.isfinite(number) and value.dtype != bool else None
-        stack = [value]
-        while stack:
-            number = stack[-1]
-            waiting = [v for v in number.operands if isinstance(v, Number) and id(v) not in self.read]
-            if id(number) in self.read:
-                stack.pop()
-            elif waiting:
-                stack += waiting
-            else:
-                found = self._one(number)
-                if found is None:
-                    return None
-                self.read[id(number)] = found
-        return self.read[id(value)]
-
-    def _one(self, number: Number) -> Linear | None:
-        name = number.name
-        if number.dtype != self.dtype or name not in _LINEAR | _KNOWN:
-            return None
-        operands: list[Linear] = []
-        for v in number.operands:
-            linear = self.read[id(v)] if isinstance(v, Number) else self.linear(v)
-            if linear is None:
-                return None
-            operands.append(linear)
-        if name in ("add", "sub"):
-            return operands[0].plus(operands[1], 1 if name == "add" else -1)
-        if name == "neg":
-            return operands[0].times(Fraction(-1))
-        if name in _LINEAR:
-            return operands[0]
-        constant = [v.constant if not v.coefficients else None for v in operands]
-        if name == "mul":
-            for factor, other in zip(constant, operands[::-1], strict=True):
-                if factor is not None:
-                    return other.times(factor)
-        if name == "div" and constant[1] is not None:
-            return operands[0].times(1 / constant[1]) if constant[1] else None
-        if name == "div":
-            inverse = self._atom(_Atom("reciprocal", None, (operands[1],)))
-            return (
-                inverse.times(constant[0])
-                if constant[0] is not None
-                else self._atom(_Atom("mul", None, (operands[0], inverse)))
-            )
-        if name == "pow" and constant[1] is None:
-            return None
-        return self._atom(_Atom(name, number.equation, tuple(operands)))

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax.inclusion.expansion import States, wider
+from gsisio_jax.inclusion.atoms import States, wider
 from gsisio_jax.interval.box import Interval, choose, plain_image
 from gsisio_jax.interval.minmax import cut, raised, smaller
 from gsisio_jax.interval.primitives import matmul

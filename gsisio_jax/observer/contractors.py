@@ -1,7 +1,7 @@
 """Contractors of one step: each takes a correct box of x[k] and returns boxes to intersect it with.
 
 Every function here is sound on its own and in any order. Rounding of sums is in what they are made of: states and
-atoms are widened once per box, for all linear images (`inclusion.expansion`).
+atoms are widened once per box, for all linear images (`inclusion.atoms`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.expansion import AtomBounds, Rows, States, of_constant, wider
+from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, wider
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.minmax import larger, smaller

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax.inclusion.expansion import wider
+from gsisio_jax.inclusion.atoms import wider
 from gsisio_jax.inclusion.transforms import affine_with_slack
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import (

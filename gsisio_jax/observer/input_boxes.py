@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.expansion import States
+from gsisio_jax.inclusion.atoms import States
 from gsisio_jax.interval.box import Interval, is_concrete, plain_image, widened
 from gsisio_jax.interval.minmax import smaller
 from gsisio_jax.interval.primitives import matmul, scale

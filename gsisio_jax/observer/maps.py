@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.expansion import AtomBounds, Expansion, Rows, States, expand, of_constant, widened, wider
+from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, widened, wider
+from gsisio_jax.inclusion.expansion import Expansion
 from gsisio_jax.inclusion.intersection import DEFAULT, bound
+from gsisio_jax.inclusion.reader import expand
 from gsisio_jax.interval.box import Interval, is_concrete, reach
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.measurement import value_at

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.expansion import AtomBounds, States
+from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import (
     Interval,

@@ -8,7 +8,9 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from gsisio_jax.inclusion.expansion import Expansion, InputBox, Rows, States, _from_node, _rule, expand
+from gsisio_jax.inclusion.atoms import Rows, States
+from gsisio_jax.inclusion.expansion import Expansion, InputBox, _from_node, _rule
+from gsisio_jax.inclusion.reader import expand
 from gsisio_jax.inclusion.rules.sincos import LIMIT, SLOT, half_sin_cos, sin_cos
 from gsisio_jax.inclusion.rules.trig import wave_atom, wave_point
 from gsisio_jax.interval import rounding
