@@ -15,23 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.handwritten_parts import (
-    EPS,
-    Box,
-    Boxes,
-    add,
-    combined,
-    least,
-    linear,
-    magnitude,
-    meet,
-    middle,
-    most,
-    negative,
-    row_times,
-    sin_cos,
-    wave,
+    EPS, Box, Boxes, add, combined, least, linear, magnitude, meet, middle, most, negative, row_times, sin_cos, wave,
     where,
-)
+)  # fmt: skip
 
 NOISE, SWEEPS = 0.2, 2
 _G = ((0, -0.1), (0.2, -0.2))
