@@ -28,6 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code.
     """
     options = _parser().parse_args(arguments)
+    _use_flags()
     try:
         code = options.command(options)
         sys.stdout.flush()
@@ -216,6 +217,12 @@ def _configuration(name: str) -> tuple[Path, Config]:
             raise UserError(f"{name}: no such file, and no built-in example of that name (there are: {known})")
     path = path.resolve()
     return path, read_config(path)
+
+
+def _use_flags() -> None:
+    from ..scalar.options import use_flags
+
+    use_flags()
 
 
 def _use_float64() -> None:

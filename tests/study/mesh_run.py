@@ -32,7 +32,7 @@ def main() -> None:
 
     job_module.run_cases = watched
     spread = gx.sweep(**study, batch=5, mesh=mesh)
-    program = kernel._run.lower(*calls[-1]).compile().as_text()
+    program = kernel.compiled().lower(*calls[-1]).compile().as_text()
 
     jobs: list[Any] = []
     job_module._compute = lambda job, *_: jobs.append(job)
