@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .._extras import MissingExtra, need
+from ..scalar.options import use_flags
 from .errors import UserError, reason
 from .help import EXAMPLES, MONTE_CARLO, SWEEP
 
@@ -28,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code.
     """
     options = _parser().parse_args(arguments)
-    _use_flags()
+    use_flags()
     try:
         code = options.command(options)
         sys.stdout.flush()
@@ -217,12 +218,6 @@ def _configuration(name: str) -> tuple[Path, Config]:
             raise UserError(f"{name}: no such file, and no built-in example of that name (there are: {known})")
     path = path.resolve()
     return path, read_config(path)
-
-
-def _use_flags() -> None:
-    from ..scalar.options import use_flags
-
-    use_flags()
 
 
 def _use_float64() -> None:

@@ -76,7 +76,7 @@ def _started() -> bool:
 
 @cache
 def _accepted(flags: str) -> bool:
-    """XLA ends the process at a flag that it does not know; other versions than the known ones try it in another one."""
+    """XLA ends the process at a flag that it does not know: a version that is not known tries it in another process."""
     import jaxlib
 
     version = tuple(int(part) for part in jaxlib.__version__.split(".")[:2])
