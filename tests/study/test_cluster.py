@@ -31,7 +31,7 @@ from gsisio_jax.study.worker import Parcel, Setting
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
-bar_module, job_module = (importlib.import_module(f"gsisio_jax.study.{name}") for name in ("bar", "job"))
+bar_module, run_module = (importlib.import_module(f"gsisio_jax.study.{name}") for name in ("bar", "run"))
 
 TILES = 8  # of 3 boxes, the last one of 1
 # A worker that dies is replaced by its nanny; the cluster must not take it for lost while a busy machine starts it.
@@ -205,7 +205,7 @@ def test_files_that_never_appear(study, tmp_path, monkeypatch):
 
 def test_a_parcel_keeps_its_precision_and_refuses_other_versions(study, monkeypatch):
     plans: list[Any] = []
-    monkeypatch.setattr(job_module, "_compute", lambda job, *_: plans.append(job))
+    monkeypatch.setattr(run_module, "_compute", lambda job, *_: plans.append(job))
     gx.sweep(**study)
     parcel = Parcel.of(plans[0], None)
     with jax.enable_x64(False):

@@ -1,4 +1,4 @@
-"""Chunks and threads: the bits do not depend on them, errors and Ctrl-C come out of them, and flags go to XLA in time."""
+"""Chunks and threads: the bits do not depend on them, errors and Ctrl-C come out of them; flags reach XLA in time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 import pytest
 from study import cluster_faults
 
@@ -66,16 +65,15 @@ def test_the_bits_do_not_depend_on_threads_and_tiles(study, monkeypatch):
     assert kernel.compiled()._cache_size() == programs
 
 
-@pytest.mark.usefixtures("chunked")
-def test_threads_compute_in_the_precision_of_the_caller(study):
+def test_threads_compute_in_the_configuration_of_the_caller():
     """Which the caller may have set for its own thread alone."""
-    assert jax.config.jax_enable_x64
-    with jax.enable_x64(False):
-        single = gx.sweep(**study)
-        programs = kernel.compiled()._cache_size()
-        same(gx.sweep(**study), single)
-    assert single.state_width_max.dtype == np.float32
-    assert kernel.compiled()._cache_size() == programs
+    seen: list[Any] = []
+    with jax.enable_x64(False), jax.default_matmul_precision("highest"), crew.Crew(2) as threads:
+        here = crew.configuration()
+        for done in threads.start(lambda part: seen.append(crew.configuration()), range(5)):
+            done.result()
+    assert seen == [here] * 5
+    assert here != crew.configuration()
 
 
 @pytest.mark.usefixtures("chunked")
@@ -149,6 +147,7 @@ def test_versions_that_are_not_known_are_tried(monkeypatch):
     options._accepted.cache_clear()
     monkeypatch.setattr("jaxlib.__version__", "0.9.1")
     assert not options._accepted("--xla_cpu_prefer_vector_width=512")
+    options._accepted.cache_clear()
     monkeypatch.setattr("jaxlib.__version__", "1.0.0")
     assert options._accepted("--xla_cpu_prefer_vector_width=512")
     assert not options._accepted("--xla_no_flag_of_this_name=1")
