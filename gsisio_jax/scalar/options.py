@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 from functools import cache
+from importlib.metadata import version
 from typing import Any
 
 FLAGS = {
@@ -77,11 +78,9 @@ def _started() -> bool:
 @cache
 def _accepted(flags: str) -> bool:
     """XLA ends the process at a flag that it does not know: a version that is not known tries it in another process."""
-    import jaxlib
-
-    version = tuple(int(part) for part in jaxlib.__version__.split(".")[:2])
-    if version < KNOWN[1]:
-        return version >= KNOWN[0]
+    installed = tuple(int(part) for part in version("jaxlib").split(".")[:2])
+    if installed < KNOWN[1]:
+        return installed >= KNOWN[0]
     command = [sys.executable, "-c", "import jax; jax.devices()"]
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
     try:

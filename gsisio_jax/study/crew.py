@@ -67,7 +67,7 @@ class Crew:
         if not self._ready:
             work(parts[0])
             self._ready, parts = True, parts[1:]
-        here, device = configuration(), jax.config.jax_default_device
+        here, device = configuration(), getattr(jax.config, "jax_default_device")  # noqa: B009 (pyright knows no such name)
 
         def configured_work(part: int) -> None:  # contexts of JAX belong to a thread
             with configured(*here), jax.default_device(device):

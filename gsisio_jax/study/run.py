@@ -10,6 +10,7 @@ import numpy as np
 
 from gsisio_jax._extras import need
 from gsisio_jax._version import __version__
+from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.study import cluster
 from gsisio_jax.study.bar import bar
 from gsisio_jax.study.certified_widths import beside, promised
