@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .._extras import MissingExtra, need
+from ..scalar.options import use_flags
 from .errors import UserError, reason
 from .help import EXAMPLES, MONTE_CARLO, SWEEP
 
@@ -28,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code.
     """
     options = _parser().parse_args(arguments)
+    use_flags()
     try:
         code = options.command(options)
         sys.stdout.flush()

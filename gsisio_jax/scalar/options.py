@@ -1,11 +1,25 @@
-"""What XLA can be told program by program."""
+"""What XLA is told, program by program or once before it starts.
+
+JAX is imported where it is needed only: what is set here must be set before it starts.
+"""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+from functools import cache
+from importlib.metadata import version
 from typing import Any
 
-import jax
+FLAGS = {
+    "xla_cpu_prefer_vector_width": "--xla_cpu_prefer_vector_width=512",
+    "xla_cpu_use_multi_output_fusion": "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true",
+}
+"""By name of what they set: vectors of 512 bits where the processor has them, and numbers of a step that share what
+they are computed from. Together they make a step faster by 1.4 to 2, and take half of the time to compile it."""
+
+KNOWN = (0, 10), (0, 11)  # versions of jaxlib, from and before
 
 
 def cpu_options() -> dict[str, Any]:
@@ -13,6 +27,8 @@ def cpu_options() -> dict[str, Any]:
 
     Taken by itself, XLA's CPU backend uses vectors of 256 bits. On other backends there is nothing to say.
     """
+    import jax
+
     return {"xla_cpu_prefer_vector_width": 512} if jax.default_backend() == "cpu" else {}
 
 
@@ -20,8 +36,54 @@ def repeated() -> int:
     """How many operations XLA may repeat for a consumer of a number before a fence (a division) pays.
 
     With multi-output fusion XLA repeats little by itself. It cannot be asked for per program, only by XLA_FLAGS before
-    JAX starts: see `flags`.
+    JAX starts: see `use_flags`.
     """
-    return int(os.environ.get("GS_W", 0)) or (
-        48 if "xla_cpu_use_multi_output_fusion=true" in os.environ.get("XLA_FLAGS", "") else 12
-    )
+    return 1_000_000 if fuses() else 12
+
+
+def fuses() -> bool:
+    """Does XLA_FLAGS ask for multi-output fusion?"""
+    return "xla_cpu_use_multi_output_fusion=true" in os.environ.get("XLA_FLAGS", "")
+
+
+def extended(given: str) -> str:
+    """XLA_FLAGS with `FLAGS` behind those that are given; what is set already stays as it is.
+
+    >>> extended("--xla_cpu_prefer_vector_width=256")
+    '--xla_cpu_prefer_vector_width=256 --xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true'
+    """
+    given = given.strip()
+    if given and not given.startswith("-"):  # the name of a file that holds them
+        return given
+    return " ".join([given, *(flag for name, flag in FLAGS.items() if f"{name}=" not in given)]).strip()
+
+
+def use_flags() -> None:
+    """Put `FLAGS` into XLA_FLAGS, as long as that is in time and this XLA knows them."""
+    given = os.environ.get("XLA_FLAGS", "")
+    wanted = extended(given)
+    if wanted != given.strip() and not _started() and _accepted(wanted):
+        os.environ["XLA_FLAGS"] = wanted
+
+
+def _started() -> bool:
+    """Has JAX read XLA_FLAGS already? It does so with its first computation; where it cannot be told, it has."""
+    try:
+        from jax._src.xla_bridge import backends_are_initialized
+    except ImportError:
+        return True
+    return backends_are_initialized()
+
+
+@cache
+def _accepted(flags: str) -> bool:
+    """XLA ends the process at a flag that it does not know: a version that is not known tries it in another process."""
+    installed = tuple(int(part) for part in version("jaxlib").split(".")[:2])
+    if installed < KNOWN[1]:
+        return installed >= KNOWN[0]
+    command = [sys.executable, "-c", "import jax; jax.devices()"]
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    try:
+        return subprocess.run(command, env=environment, capture_output=True, timeout=60).returncode == 0
+    except (OSError, subprocess.SubprocessError):
+        return False

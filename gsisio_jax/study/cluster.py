@@ -1,7 +1,8 @@
 """A study on the workers of a Dask cluster: tiles are tasks, and a worker that dies costs the tile that it had at hand.
 
 The job travels once to every worker. With a store the workers write their tiles themselves and only say so; otherwise
-the results come back as they are ready. A worker computes one tile at a time, on as many cores as Dask gave it threads.
+the results come back as they are ready. A worker computes one tile at a time, on as many cores as Dask gave it threads,
+and rounds as this process does: it takes over the configuration of JAX, and the flags of XLA where it has not started.
 """
 
 from __future__ import annotations

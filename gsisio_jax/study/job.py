@@ -1,32 +1,34 @@
-"""A study as tiles that any process can compute, and the run that collects them."""
+"""A study as tiles that any process can compute."""
 
 from __future__ import annotations
 
-import contextlib
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from gsisio_jax._extras import need
-from gsisio_jax._version import __version__
 from gsisio_jax.observer.checks import AnyObserver
-from gsisio_jax.study import cluster, devices
+from gsisio_jax.observer.fixed import Fixed
+from gsisio_jax.study import devices
 from gsisio_jax.study.axes import Layout
-from gsisio_jax.study.certified_widths import along, beside, promised
-from gsisio_jax.study.kernel import fingerprint, outline, run_cases, tile_size
-from gsisio_jax.study.labels import Labels, coordinates_of, variables_of
+from gsisio_jax.study.certified_widths import along, promised
+from gsisio_jax.study.crew import Crew
+from gsisio_jax.study.kernel import chunk_size, fingerprint, outline, run_cases, tile_size
 from gsisio_jax.study.reduction_base import Reduction
 from gsisio_jax.study.row_source import Rows
 
-PATIENCE = 2.0  # seconds before a bar appears
-
 Results = dict[str, np.ndarray]
+
+
+class Running(NamedTuple):
+    """A tile that was started: its results, on a CPU as far as its chunks are done."""
+
+    results: dict[str, Any]
+    chunks: list[Future[None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,7 @@ class Job:
         reductions: what is kept of every run.
         hold: as in `estimate`, ``on_conflict="hold"``.
         size: cases per tile.
+        chunk: cases that a CPU takes at once, the same for all tiles.
         shapes: of the results of one case.
         cost: bytes of working set of a case, where the size of a tile was chosen by it.
         mesh: devices that share a tile, from `devices.flat`.
@@ -55,6 +58,7 @@ class Job:
     reductions: tuple[Reduction, ...]
     hold: bool
     size: int
+    chunk: int
     shapes: dict[str, jax.ShapeDtypeStruct]
     cost: float | None = None
     mesh: Mesh | None = None
@@ -85,9 +89,10 @@ class Job:
         if dtype != np.float64:
             observer = observer.astype(dtype)
         one, shared = layout.take(arguments, np.zeros(1, int)), layout.shared(arguments)
-        shapes, cost = outline(observer, one, shared, rows, reductions, hold)
+        shapes, cost, step = outline(observer, one, shared, rows, reductions, hold)
         size, chosen = _batch(call, batch, cost, layout.cases), cost if batch is None else None
-        return cls(call, observer, arguments, layout, rows, reductions, hold, size, shapes, chosen)
+        chunk = min(chunk_size(step), size)
+        return cls(call, observer, arguments, layout, rows, reductions, hold, size, chunk, shapes, chosen)
 
     def on(self, mesh: Any) -> Job:
         """The same study with every tile spread over devices; a chosen tile grows with their number.
@@ -100,12 +105,10 @@ class Job:
         return replace(self, size=size, mesh=mesh)
 
     @cached_property
-    def _fixed(self) -> tuple[AnyObserver, Any]:
-        """What all tiles share, on the devices."""
+    def _common(self) -> tuple[Fixed, Any]:
+        """What all tiles share: the observer, and arguments on the devices."""
         shared = self.layout.shared(self.arguments)
-        if self.mesh is None:
-            return self.observer, jax.device_put(shared)
-        return devices.copied(self.observer, self.mesh), devices.copied(shared, self.mesh)
+        return Fixed(self.observer), jax.device_put(shared) if self.mesh is None else devices.copied(shared, self.mesh)
 
     @property
     def tiles(self) -> int:
@@ -116,24 +119,43 @@ class Job:
         """Numbers of the cases of a tile."""
         return np.arange(tile * self.size, min((tile + 1) * self.size, self.layout.cases))
 
-    def start(self, tile: int) -> dict[str, Any]:
-        """Results of a tile, started but not waited for; the last one is filled up with its last case."""
+    def start(self, tile: int, crew: Crew) -> Running:
+        """Start a tile, and do not wait for it.
+
+        On a CPU the crew computes it in chunks, the last one filled up with the last case of the tile. A GPU takes all
+        at once, and so does a mesh; there the last tile is filled up with its last case.
+        """
+        cases = self.cases(tile)
+        if self.mesh is None and jax.default_backend() == "cpu":
+            results = {name: np.empty((len(cases), *s.shape), s.dtype) for name, s in self.shapes.items()}
+
+            def work(first: int) -> None:
+                part = cases[np.minimum(first + np.arange(self.chunk), len(cases) - 1)]
+                for name, array in self._call(part).items():
+                    results[name][first : first + self.chunk] = np.asarray(array)[: len(cases) - first]
+
+            return Running(results, crew.start(work, range(0, len(cases), self.chunk)))
         count = self.size if self.mesh is None else devices.padded(self.size, self.mesh)
-        cases = np.minimum(tile * self.size + np.arange(count), self.layout.cases - 1)
+        return Running(self._call(np.minimum(tile * self.size + np.arange(count), self.layout.cases - 1)), [])
+
+    def _call(self, cases: np.ndarray) -> dict[str, Any]:
         varying = self.layout.take(self.arguments, cases)
         if self.mesh is not None:
             varying = devices.spread(varying, self.mesh)
-        observer, shared = self._fixed
+        observer, shared = self._common
         return run_cases(observer, varying, shared, self.rows, self.reductions, self.hold)
 
-    def finish(self, tile: int, running: dict[str, Any]) -> Results:
+    def finish(self, tile: int, running: Running) -> Results:
         """Wait for a tile that was started, and check it.
 
         Raises:
             ValueError: the results cannot be (see `Rows.check`).
+            Exception: what a chunk raised.
         """
+        for chunk in running.chunks:
+            chunk.result()
         cases = self.cases(tile)
-        results = {name: np.asarray(array)[: len(cases)] for name, array in running.items()}
+        results = {name: np.asarray(array)[: len(cases)] for name, array in running.results.items()}
         self.rows.check(self, cases, results)
         return results
 
@@ -144,118 +166,6 @@ class Job:
         if self.mesh is not None and self.mesh.size > 1:
             rest.append(f"{self.mesh.size} devices")  # each runs a smaller tile, which may round in other places
         return fingerprint(self.observer, self.arguments, self.rows, self.reductions, *rest)
-
-
-def run(
-    job: Job,
-    observer: AnyObserver,
-    labels: Labels,
-    title: str,
-    store: Any,
-    resume: bool,
-    progress: bool,
-    client: Any = None,
-    mesh: Any = None,
-) -> Any:
-    """All tiles of a study, as the labelled dataset.
-
-    Args:
-        job: the study.
-        observer: as the user gave it (that of the job may be in single precision).
-        labels: names and units.
-        title: attribute of the dataset.
-        store: path, or None for memory.
-        resume: go on with a store that is there.
-        progress: show a bar.
-        client: of a Dask cluster that computes the tiles, or None for this process.
-        mesh: local devices that share every tile, or None.
-
-    Raises:
-        ValueError: `client` and `mesh` together, or one of them cannot be used; or a tile fails.
-    """
-    xarray = need("xarray", extra="study", purpose="a study")
-    if client is not None and mesh is not None:
-        raise ValueError(
-            f"{job.call}: `client` and `mesh` cannot be combined; give `client` for several machines (each worker uses "
-            "the first device that it sees), or `mesh` for several devices of this one"
-        )
-    if client is not None:
-        cluster.check(job.call, client)
-    if mesh is not None:
-        job = job.on(mesh)
-    layout = job.layout
-    variables = variables_of((*job.reductions, job.rows), job.shapes, labels)
-    coordinates = coordinates_of(layout, job.reductions, labels, variables)
-    attributes = {
-        "title": title,
-        "certificate": str(observer.certificate),
-        "guaranteed": observer.guaranteed,
-        "steps": labels.steps,
-        "tile": job.size,
-        "library": f"gsisio_jax {__version__}, jax {jax.__version__}",
-    }
-    if store is None:
-        values = {name: np.empty((layout.cases, *v[0]), v[1]) for name, v in variables.items()}
-
-        def keep(tile: int, results: Results) -> None:
-            for name, array in results.items():
-                values[name][job.cases(tile)[0] : job.cases(tile)[-1] + 1] = array
-
-        with _bar(job, range(job.tiles), progress) as advance:
-            if client is None:
-                _compute(job, range(job.tiles), keep, advance)
-            else:
-                cluster.compute(client, job, range(job.tiles), advance, keep=keep)
-        data = {
-            name: ((*layout.names, *dims), values[name].reshape((*layout.sizes, *shape)), about)
-            for name, (shape, _, dims, about) in variables.items()
-        }
-        result = xarray.Dataset(data, coords=coordinates, attrs=attributes)
-    else:
-        from gsisio_jax.study.store import Header, TileStore
-
-        axes = dict(zip(layout.names, layout.sizes, strict=True))
-        header = Header(layout.cases, job.size, variables, coordinates, attributes, job.fingerprint(), axes)
-        tiles = TileStore.open(store, header, resume)
-        missing = tiles.missing()
-        with _bar(job, missing, progress) as advance:
-            if client is None:
-                _compute(job, missing, tiles.write, advance)
-            else:
-                cluster.compute(client, job, missing, advance, store=tiles)
-        result = tiles.dataset()
-    return result.assign(beside(observer, layout, promised(observer.certificate, job.arguments["noise"]), labels))
-
-
-@contextlib.contextmanager
-def _bar(job: Job, tiles: Sequence[int], progress: bool) -> Iterator[Callable[[int], None]]:
-    """What is to be called after every tile; moves a bar where there is a terminal."""
-    if not (progress and tiles and sys.stderr.isatty()):
-        yield lambda tile: None
-        return
-    tqdm = need("tqdm", extra="study", purpose="a progress bar (progress=False does without)")
-    with tqdm.tqdm(total=job.layout.cases, unit="case", unit_scale=True, delay=PATIENCE, leave=False) as bar:
-        bar.update(job.layout.cases - sum(len(job.cases(tile)) for tile in tiles))
-        yield lambda tile: bar.update(len(job.cases(tile)))
-
-
-def _compute(
-    job: Job, tiles: Sequence[int], keep: Callable[[int, Results], None], advance: Callable[[int], None]
-) -> None:
-    """Tiles in order, two at a time: one is started before the last one is waited for, so that no core stands idle."""
-
-    def finish(tile: int, running: dict[str, Any]) -> None:
-        keep(tile, job.finish(tile, running))
-        advance(tile)
-
-    before: tuple[int, dict[str, Any]] | None = None
-    for tile in tiles:
-        running = job.start(tile)
-        if before is not None:
-            finish(*before)
-        before = tile, running
-    if before is not None:
-        finish(*before)
 
 
 def _batch(call: str, batch: int | None, cost: float, cases: int) -> int:

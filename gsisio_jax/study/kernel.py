@@ -16,20 +16,22 @@ import numpy as np
 from gsisio_jax import scalar
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.checks import AnyObserver
-from gsisio_jax.observer.fixed import Fixed, chosen, fixed
+from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.scalar.options import cpu_options
 from gsisio_jax.study.axes import bare
 from gsisio_jax.study.reduction_base import Context, Kept, Reduction
 from gsisio_jax.study.row_source import Rows
 
 TARGET_BYTES = 256 * 2**20  # working set of a tile
+CHUNK_BYTES = 4 * 2**20  # of a chunk, to stay in the caches of a core
+CHUNKS = 256, 8192  # smallest and largest: every step of a chunk costs some microseconds, however few cases it has
 # What XLA holds for a step, in sizes of what the scan carries: 6.1 for two states with sines, 3.7 for four with roots
 # (`memory_analysis` of compiled tiles).
 TEMPORARIES = 6
 
 
 def run_cases(
-    observer: AnyObserver,
+    observer: Fixed,
     varying: Mapping[str, Any],
     shared: Mapping[str, Any],
     rows: Rows,
@@ -38,11 +40,11 @@ def run_cases(
 ) -> dict[str, Any]:
     """Run the observer on B cases and reduce every run as it goes along.
 
-    Nothing of size T x B is stored but what a `Kept` reduction asks for. Compiled once for equal shapes, and then the
-    results of a case depend on nothing but its numbers: equal tile sizes give equal bits.
+    Nothing of size T x B is stored but what a `Kept` reduction asks for. Compiled once for equal observers and
+    shapes, and then the results of a case depend on nothing but its numbers: equal B give equal bits.
 
     Args:
-        observer: in the type of the data.
+        observer: in the type of the data; its numbers are constants of the program.
         varying: arguments with a leading axis B, from `Layout.take`; None where shared or absent.
         shared: the others, from `Layout.shared`.
         rows: what the observer is given at every step.
@@ -52,26 +54,24 @@ def run_cases(
     Returns:
         Arrays (B, ...) by name, not waited for.
     """
-    static, traced = fixed(observer)
-    return _compiled()(static, traced, dict(varying), dict(shared), rows, reductions, hold)
+    return compiled()(observer, dict(varying), dict(shared), rows, reductions, hold)
 
 
 @cache  # not at import: asking for the backend starts JAX
-def _compiled() -> Any:
-    return jax.jit(_run, static_argnames=("static", "rows", "reductions", "hold"), compiler_options=cpu_options())
+def compiled() -> Any:
+    """The jitted function behind `run_cases`."""
+    return jax.jit(_run, static_argnames=("fixed", "rows", "reductions", "hold"), compiler_options=cpu_options())
 
 
 def _run(
-    static: Fixed | None,
-    traced: Any,
+    fixed: Fixed,
     varying: Any,
     shared: Any,
     rows: Rows,
     reductions: tuple[Reduction, ...],
     hold: bool,
 ) -> Any:
-    observer = chosen(static, traced)
-    return jax.vmap(lambda one: _case(observer, eqx.combine(one, shared), rows, reductions, hold))(varying)
+    return jax.vmap(lambda one: _case(fixed.value, eqx.combine(one, shared), rows, reductions, hold))(varying)
 
 
 def _case(
@@ -130,11 +130,14 @@ def outline(
     source: Rows,
     reductions: tuple[Reduction, ...],
     hold: bool,
-) -> tuple[dict[str, jax.ShapeDtypeStruct], float]:
-    """Shapes of the results of one case, and the bytes of working set that one case costs; nothing is compiled.
+) -> tuple[dict[str, jax.ShapeDtypeStruct], float, float]:
+    """Shapes of the results of one case, and the bytes that it costs; nothing is compiled.
 
     Args:
         varying: arguments of any one case, with a leading axis of 1; the others as in `run_cases`.
+
+    Returns:
+        Shapes, the bytes of working set, and how many of them every step goes through.
     """
 
     def small(observer: AnyObserver, varying: Any, shared: Any) -> Any:
@@ -152,8 +155,8 @@ def outline(
 
     results, moving, kept = jax.eval_shape(small, observer, dict(varying), dict(shared))
     # Inputs and kept rows are copied once on their way: the scan wants time first.
-    count = 2 * _bytes(varying) + TEMPORARIES * _bytes(moving) + 2 * _bytes(kept) + _bytes(results)
-    return results, float(count)
+    step = TEMPORARIES * _bytes(moving)
+    return results, float(2 * _bytes(varying) + step + 2 * _bytes(kept) + _bytes(results)), float(step)
 
 
 def tile_size(bytes_per_case: float, cases: int) -> int:
@@ -168,6 +171,17 @@ def tile_size(bytes_per_case: float, cases: int) -> int:
     most = 2 ** int(np.log2(max(TARGET_BYTES / bytes_per_case, 1)))
     tiles = -(-cases // most)
     return -(-cases // tiles)
+
+
+def chunk_size(bytes_per_step: float) -> int:
+    """Cases that one call of the program computes on a CPU: a power of two whose steps stay in the caches of a core.
+
+    It depends on the study alone, neither on the machine nor on the number of threads, and so do the bits.
+
+    >>> chunk_size(2500.0), chunk_size(1e9), chunk_size(8.0)
+    (1024, 256, 8192)
+    """
+    return min(max(2 ** int(np.log2(max(CHUNK_BYTES / bytes_per_step, 1))), CHUNKS[0]), CHUNKS[1])
 
 
 def _bytes(tree: Any) -> int:

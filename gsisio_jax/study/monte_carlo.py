@@ -18,10 +18,11 @@ from gsisio_jax.observer.estimation import OnConflict
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.axes import RUN, Axis, Layout, prepare
 from gsisio_jax.study.containment import Containment, TrueRun
-from gsisio_jax.study.job import Job, run
+from gsisio_jax.study.job import Job
 from gsisio_jax.study.labels import Labels
 from gsisio_jax.study.plant import Simulated
 from gsisio_jax.study.reductions import resolve
+from gsisio_jax.study.run import run
 from gsisio_jax.study.summary import check_confidence, summary
 from gsisio_jax.study.truth import Coverage
 

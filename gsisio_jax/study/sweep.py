@@ -13,10 +13,11 @@ from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.estimation import OnConflict
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.axes import Axis, Layout, bare, prepare
-from gsisio_jax.study.job import Job, run
+from gsisio_jax.study.job import Job
 from gsisio_jax.study.labels import Labels
 from gsisio_jax.study.reductions import resolve
 from gsisio_jax.study.row_source import Recorded
+from gsisio_jax.study.run import run
 
 CALL = "sweep"
 
@@ -51,7 +52,7 @@ def sweep(
     An argument with a leading batch axis varies. `grid` gives that axis a name: different names are combined in all
     ways, equal names are paired; without `grid` the axis is called "run". Arguments without a batch axis are shared.
     Every case equals the single call ``estimate(observer, initial, y, u, noise, on_conflict, length)`` up to rounding;
-    bit for bit only between sweeps with tiles of equal size.
+    bit for bit only between sweeps, on a CPU with tiles of any size that is not below a chunk, however many threads.
 
     Args:
         observer: from `design_observer`.
@@ -65,7 +66,8 @@ def sweep(
             a batch axis.
         reduce: names out of `study.REDUCTIONS`, or `Reduction` objects. Width names give ``state_width_<name>`` and
             ``input_width_<name>``. None keeps every box and status (in memory, or in `store`).
-        batch: cases per tile; None chooses a size whose working set stays near 256 MiB. Two tiles run at a time.
+        batch: cases per tile, the unit of `store` and of a cluster; None chooses a size whose working set stays near
+            256 MiB. Two tiles run at a time. On a CPU all usable cores share them, in chunks of about a thousand cases.
         store: path of a Zarr store that takes the tiles; finished ones are not computed again. None: memory.
         resume: go on with a store that exists; False refuses it.
         client: a ``dask.distributed.Client`` whose workers compute the tiles, and write them straight into `store`.

@@ -12,10 +12,11 @@ from functools import cache, cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-import numpy as np
 
 from gsisio_jax._extras import need
 from gsisio_jax._version import __version__
+from gsisio_jax.scalar.options import fuses, use_flags
+from gsisio_jax.study.crew import Crew, configuration, configured
 
 if TYPE_CHECKING:
     from gsisio_jax.study.job import Job, Results
@@ -35,6 +36,7 @@ class Setting(NamedTuple):
     x64: bool
     threefry_partitionable: bool
     matmul_precision: str | None
+    fuses: bool
 
     @classmethod
     def here(cls) -> Setting:
@@ -43,8 +45,8 @@ class Setting(NamedTuple):
             ".".join(platform.python_version_tuple()[:2]),
             jax.__version__,
             __version__,
-            jax.dtypes.canonicalize_dtype(np.float64) == np.float64,
-            *(getattr(jax.config, f"jax_{name}") for name in ("threefry_partitionable", "default_matmul_precision")),
+            *configuration(),
+            fuses(),
         )
 
     @contextlib.contextmanager
@@ -62,11 +64,7 @@ class Setting(NamedTuple):
                 f"{call}: a worker on {platform.node()} has {', '.join(differ)}, so its numbers could differ; install "
                 "the same versions on the workers"
             )
-        with (
-            jax.enable_x64(self.x64),
-            jax.threefry_partitionable(self.threefry_partitionable),
-            jax.default_matmul_precision(self.matmul_precision),
-        ):
+        with configured(self.x64, self.threefry_partitionable, self.matmul_precision):
             yield
 
 
@@ -96,7 +94,9 @@ class Parcel:
         """
         pickle = need("cloudpickle", extra="cluster", purpose="`client`")
         try:
-            program = pickle.dumps((job.observer, job.rows, job.reductions))
+            # Without what is kept beside it here, so that equal observers are equal bytes.
+            observer = jax.tree.map(lambda leaf: leaf, job.observer)
+            program = pickle.dumps((observer, job.rows, job.reductions))
         except Exception as error:
             raise ValueError(
                 f"{job.call}: the observer cannot be sent to workers: {error}; f, g and functions of the study must "
@@ -130,10 +130,10 @@ def _unpacked(program: bytes, x64: bool) -> Any:
 def compute_tile(parcel: Parcel, tile: int) -> Results | None:
     """The task: one tile, on a worker."""
     with _one_tile:
-        _limit_threads()
-        with parcel.setting.applied(parcel.rest.call):
+        threads = _prepare(parcel.setting.fuses)
+        with parcel.setting.applied(parcel.rest.call), Crew(threads) as crew:
             job = parcel.job
-            results = job.finish(tile, job.start(tile))
+            results = job.finish(tile, job.start(tile, crew))
     if parcel.store is None:
         return results
     parcel.store.write(tile, results)
@@ -141,17 +141,26 @@ def compute_tile(parcel: Parcel, tile: int) -> Results | None:
 
 
 @cache
-def _limit_threads() -> None:
-    """Let XLA make as many threads as Dask gave this worker, before it makes any; otherwise every worker would take all
-    cores of the machine. Nothing happens where it has made them already, or where the environment says how many."""
+def _prepare(flags: bool) -> int:
+    """Before JAX starts: let XLA make as many threads as Dask gave this worker, otherwise every worker would take all
+    cores of the machine; and give it the flags of the sender, otherwise it would round in other places.
+
+    Nothing happens where JAX has started already. Threads are left alone where the environment says how many.
+
+    Returns:
+        Threads for a tile.
+    """
     distributed = need("distributed", extra="cluster", purpose="a worker")
     system = need("dask.system", extra="cluster", purpose="a worker")
+    if flags:
+        use_flags()
+    threads = min(distributed.get_worker().state.nthreads, system.CPU_COUNT)
     if any(name in os.environ for name in POOL):
-        return
-    threads = str(min(distributed.get_worker().state.nthreads, system.CPU_COUNT))
-    os.environ.update(dict.fromkeys(POOL, threads))
+        return threads
+    os.environ.update(dict.fromkeys(POOL, str(threads)))
     try:
         jax.devices()
     finally:
         for name in POOL:
             del os.environ[name]
+    return threads

@@ -52,8 +52,8 @@ def die_computing() -> None:
     """At the second tile from now on, while XLA is at it."""
     start, left = Job.start, [1]
 
-    def deadly(self: Job, tile: int) -> Any:
-        running = start(self, tile)
+    def deadly(self: Job, tile: int, crew: Any) -> Any:
+        running = start(self, tile, crew)
         if left[0] == 0:
             os.kill(os.getpid(), signal.SIGKILL)
         left[0] -= 1
@@ -84,7 +84,7 @@ def die_writing() -> None:
 def fail(error: bool) -> None:
     """Every tile from now on: with an error, or with the death of the worker."""
 
-    def failing(self: Job, tile: int) -> Any:
+    def failing(self: Job, tile: int, crew: Any) -> Any:
         if error:
             raise ContainmentLost(f"sweep: run 17 of tile {tile} is lost")
         os.kill(os.getpid(), signal.SIGKILL)
@@ -99,7 +99,7 @@ def state() -> dict[str, Any]:
         "pid": os.getpid(),
         "x64": jax.config.jax_enable_x64,
         "pool": names.count("tf_XLAEigen"),
-        "programs": kernel._run._cache_size(),
+        "programs": kernel.compiled()._cache_size() if kernel.compiled.cache_info().currsize else 0,
     }
 
 
@@ -107,8 +107,8 @@ def slow() -> None:
     """Tiles take a while from now on."""
     start = Job.start
 
-    def slowly(self: Job, tile: int) -> Any:
+    def slowly(self: Job, tile: int, crew: Any) -> Any:
         time.sleep(0.1)
-        return start(self, tile)
+        return start(self, tile, crew)
 
     Job.start = slowly

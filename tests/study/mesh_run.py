@@ -13,6 +13,7 @@ from study import cluster_faults
 import gsisio_jax as gx
 from gsisio_jax.study import job as job_module
 from gsisio_jax.study import kernel
+from gsisio_jax.study import run as run_module
 
 TALK = ("all-reduce", "all-gather", "all-to-all", "collective-permute")
 
@@ -32,10 +33,10 @@ def main() -> None:
 
     job_module.run_cases = watched
     spread = gx.sweep(**study, batch=5, mesh=mesh)
-    program = kernel._run.lower(*calls[-1]).compile().as_text()
+    program = kernel.compiled().lower(*calls[-1]).compile().as_text()
 
     jobs: list[Any] = []
-    job_module._compute = lambda job, *_: jobs.append(job)
+    run_module._compute = lambda job, *_: jobs.append(job)
     gx.sweep(**study, batch=5)
     gx.sweep(**study, batch=5, mesh=mesh)
     kernel.TARGET_BYTES = 1 << 14

@@ -31,7 +31,7 @@ from gsisio_jax.study.worker import Parcel, Setting
 
 dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
-job_module = importlib.import_module("gsisio_jax.study.job")
+bar_module, run_module = (importlib.import_module(f"gsisio_jax.study.{name}") for name in ("bar", "run"))
 
 TILES = 8  # of 3 boxes, the last one of 1
 # A worker that dies is replaced by its nanny; the cluster must not take it for lost while a busy machine starts it.
@@ -84,7 +84,7 @@ class Terminal(io.StringIO):
 
 def test_workers_give_the_same_bits_and_compile_once(study, expected, client, log, monkeypatch):
     """Each in the precision of this process, on one core, with a bar as at home."""
-    monkeypatch.setattr(job_module, "PATIENCE", 0.0)
+    monkeypatch.setattr(bar_module, "PATIENCE", 0.0)
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", Terminal())
         same(gx.sweep(**study, client=client), expected)
@@ -205,7 +205,7 @@ def test_files_that_never_appear(study, tmp_path, monkeypatch):
 
 def test_a_parcel_keeps_its_precision_and_refuses_other_versions(study, monkeypatch):
     plans: list[Any] = []
-    monkeypatch.setattr(job_module, "_compute", lambda job, *_: plans.append(job))
+    monkeypatch.setattr(run_module, "_compute", lambda job, *_: plans.append(job))
     gx.sweep(**study)
     parcel = Parcel.of(plans[0], None)
     with jax.enable_x64(False):

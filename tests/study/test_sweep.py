@@ -386,7 +386,7 @@ class Terminal(io.StringIO):
 
 
 def test_a_bar_appears_on_a_terminal_only(plain, in_tiles_of_four, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("gsisio_jax.study.job"), "PATIENCE", 0.0)
+    monkeypatch.setattr(importlib.import_module("gsisio_jax.study.bar"), "PATIENCE", 0.0)
     shown = []
     for stream in (Terminal(), io.StringIO()):
         with monkeypatch.context() as patch:

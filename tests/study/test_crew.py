@@ -1,0 +1,154 @@
+"""Chunks and threads: the bits do not depend on them, errors and Ctrl-C come out of them; flags reach XLA in time."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+from study import cluster_faults
+
+import gsisio_jax as gx
+from gsisio_jax.scalar import options
+from gsisio_jax.study import crew, kernel
+from gsisio_jax.study.store import TileStore
+
+job_module = importlib.import_module("gsisio_jax.study.job")
+CHUNK = 4  # of 22 cases: 5 full ones and half of one
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    return cluster_faults.study(tmp_path_factory.mktemp("crew") / "traced")
+
+
+@pytest.fixture
+def chunked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job_module, "chunk_size", lambda step: CHUNK)
+    monkeypatch.setattr(crew, "usable", lambda: 3)
+
+
+def same(one: Any, other: Any) -> None:
+    """Bit for bit."""
+    for name in other.data_vars:
+        assert one[name].values.tobytes() == other[name].values.tobytes(), name
+
+
+@pytest.mark.usefixtures("chunked")
+def test_the_bits_do_not_depend_on_threads_and_tiles(study, monkeypatch):
+    """Tiles that are whole chunks, a ragged one, and one that is smaller than a chunk; the program is compiled once."""
+    seen: list[tuple[str, int]] = []
+
+    def watched(*arguments: Any) -> Any:
+        seen.append((threading.current_thread().name, len(arguments[1]["case"])))
+        return kernel.run_cases(*arguments)
+
+    monkeypatch.setattr(job_module, "run_cases", watched)
+    expected = gx.sweep(**study, batch=CHUNK)
+    programs = kernel.compiled()._cache_size()
+    for threads in (1, 2, 3):
+        monkeypatch.setattr(crew, "usable", lambda threads=threads: threads)
+        for batch in (None, 8, 10):
+            seen.clear()
+            same(gx.sweep(**study, batch=batch), expected)
+            assert {size for _, size in seen} == {CHUNK}
+            names = {name for name, _ in seen[1:]}
+            assert len(names) <= threads
+            assert threading.current_thread().name not in names
+    assert kernel.compiled()._cache_size() == programs
+
+
+def test_threads_compute_in_the_configuration_of_the_caller():
+    """Which the caller may have set for its own thread alone."""
+    seen: list[Any] = []
+    with jax.enable_x64(False), jax.default_matmul_precision("highest"), crew.Crew(2) as threads:
+        here = crew.configuration()
+        for done in threads.start(lambda part: seen.append(crew.configuration()), range(5)):
+            done.result()
+    assert seen == [here] * 5
+    assert here != crew.configuration()
+
+
+@pytest.mark.usefixtures("chunked")
+def test_an_error_in_a_thread_reaches_the_caller_once(study, monkeypatch):
+    """Whichever chunk it is in; what has not begun is not done."""
+    calls: list[int] = []
+
+    def failing(*arguments: Any) -> Any:
+        calls.append(int(arguments[1]["case"][0]))
+        if calls[-1] >= CHUNK:
+            raise ValueError(f"case {calls[-1]} cannot be")
+        return kernel.run_cases(*arguments)
+
+    monkeypatch.setattr(job_module, "run_cases", failing)
+    before = threading.active_count()
+    with pytest.raises(ValueError, match=r"^case 4 cannot be$"):
+        gx.sweep(**study)
+    assert threading.active_count() == before
+    assert calls.count(CHUNK) == 1
+
+
+@pytest.mark.usefixtures("chunked")
+def test_an_interrupt_leaves_the_store_as_it_should_be(study, monkeypatch, tmp_path):
+    """Ctrl-C while threads compute: finished tiles are kept, and the same call goes on to the same bits."""
+    expected = gx.sweep(**study, batch=8)
+
+    def interrupted(*arguments: Any) -> Any:
+        if arguments[1]["case"][0] == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+        return kernel.run_cases(*arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(job_module, "run_cases", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            gx.sweep(**study, batch=8, store=tmp_path / "store")
+    assert 2 in TileStore.load(tmp_path / "store").missing()
+    assert not list((tmp_path / "store").rglob("*.part"))
+    same(gx.sweep(**study, batch=8, store=tmp_path / "store"), expected)
+
+
+def test_a_chunk_depends_on_the_study_alone():
+    assert [kernel.chunk_size(step) for step in (1e9, 2500.0, 1.0)] == [256, 1024, 8192]
+    assert 1 <= crew.usable() <= (os.cpu_count() or 1)
+
+
+def test_flags_are_added_to_those_that_are_given():
+    width, fusion = options.FLAGS.values()
+    assert options.extended("") == f"{width} {fusion}"
+    assert options.extended("--xla_dump_to=/tmp/x ") == f"--xla_dump_to=/tmp/x {width} {fusion}"
+    others = "--xla_cpu_prefer_vector_width=128 --xla_backend_extra_options=xla_cpu_use_multi_output_fusion=false"
+    for given in (others, "a_file_of_flags"):
+        assert options.extended(given) == given
+
+
+def test_flags_are_set_in_time_or_not_at_all(monkeypatch):
+    """In time: gsisio_jax is imported and JAX has not computed. XLA would end the process if it did not know one."""
+    jax.devices()
+    monkeypatch.setenv("XLA_FLAGS", "--xla_dump_to=/tmp/x")
+    options.use_flags()
+    assert os.environ["XLA_FLAGS"] == "--xla_dump_to=/tmp/x"
+    assert options.repeated() == 12
+    code = "from gsisio_jax.cli import main\ntry: main(['design', 'none'])\nfinally:\n import jax; jax.devices()\n"
+    code += " from gsisio_jax.scalar import options; print(options.fuses(), options.repeated())"
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    environment["PYTHONPATH"] = str(Path(gx.__file__).parents[1])
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.stdout == "True 1000000\n", done.stderr
+
+
+def test_versions_that_are_not_known_are_tried(monkeypatch):
+    options._accepted.cache_clear()
+    monkeypatch.setattr(options, "version", lambda package: "0.9.1")
+    assert not options._accepted("--xla_cpu_prefer_vector_width=512")
+    options._accepted.cache_clear()
+    monkeypatch.setattr(options, "version", lambda package: "1.0.0")
+    assert options._accepted("--xla_cpu_prefer_vector_width=512")
+    assert not options._accepted("--xla_no_flag_of_this_name=1")
+    options._accepted.cache_clear()
