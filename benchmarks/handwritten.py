@@ -15,7 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.handwritten_parts import (
-    EPS, Box, Boxes, add, combined, least, linear, magnitude, meet, middle, most, negative, row_times, sin_cos, wave,
+    EPS,
+    Box,
+    Boxes,
+    add,
+    combined,
+    least,
+    linear,
+    magnitude,
+    meet,
+    middle,
+    most,
+    negative,
+    row_times,
+    sin_cos,
+    wave,
     where,
 )  # fmt: skip
 

@@ -195,7 +195,7 @@ class Expansion:
         if curve is not None and moving:
             return self._bent(curve, memo[id(moving[0])], states)
         if atom.name == "mul" and len(moving) == 2:
-            return self._product(*(memo[id(t)] for t in moving), states)
+            return self._product(memo[id(moving[0])], memo[id(moving[1])], states)
         nodes = [
             memo[id(t)].node(domain) if t.coefficients else _number(t, states.center.dtype) for t in atom.arguments
         ]

@@ -422,7 +422,8 @@ def _bend_line(curve: Curve) -> Callable[[Any, Any, float], Line]:
     are off by ``ulps eps s (b - a)`` and the ulps of phi, and by six roundings.
     """
     center = 0.5 * (curve.phi.ends[0] + curve.phi.ends[1])
-    ulps = curve.phi.ulps + 4 * curve.slope.ulps + 16
+    ulps, contact = curve.phi.ulps + 4 * curve.slope.ulps + 16, curve.contact
+    assert contact is not None
 
     def line(a: Any, b: Any, kappa: float) -> Line:
         far = float(jnp.finfo(a.dtype).max) ** 0.25  # values do not change any more from there on
@@ -437,7 +438,7 @@ def _bend_line(curve: Curve) -> Callable[[Any, Any, float], Line]:
         d = b - a
         wide = d > jnp.maximum(1e-3 * jnp.maximum(abs(a), abs(b)), 1 / far)  # else its derivative overflows
         secant = jnp.where(wide, v - u, 1) / jnp.where(wide, d, 1)
-        m = jnp.where(wide, curve.contact(jnp.maximum(secant, 1 / far)), abs(0.5 * (a + b)))
+        m = jnp.where(wide, contact(jnp.maximum(secant, 1 / far)), abs(0.5 * (a + b)))
         s = curve.slope.fn(m)
         m = jax.lax.stop_gradient(m)
         touch = jax.lax.stop_gradient(curve.phi.fn(m)) - s * m
