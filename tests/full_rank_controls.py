@@ -21,7 +21,7 @@ from gsisio_jax.examples import paper
 
 STEPS = 200
 VARIANTS = "abc"
-"""Those of the design text; "d" is a fourth one, on which the corrected condition (i) of Theorem 2 holds."""
+"""Those of theory 12.2; "d" is a fourth one, on which the corrected condition (i) of Theorem 2 holds."""
 _SHARE = {"a": 0.5, "b": 1.0, "c": 1.0, "d": 0.3}  # of the paper's f
 _FEEDTHROUGH = {
     "a": [[1.0, 0.3], [0.2, -1.0]],

@@ -1,4 +1,4 @@
-"""The test systems of the design text, with the regions they are designed on and signals to run them with.
+"""The test systems of docs/theory.md, section 12, with the regions they are designed on and signals to run them with.
 
 Each `Case` can simulate runs in which the unknown input is known, so that containment can be checked.
 """

@@ -74,7 +74,7 @@ def affine_abstraction(
     >>> planes.upper_slope.tolist(), planes.over(Interval([1.0], [3.0])).upper.round(6).tolist()
     ([[4.0]], [9.0])
 
-    Source: paper, Prop. 1, (eq:abstraction) and Cor. 1; design 5.
+    Source: paper, Prop. 1, (eq:abstraction) and Cor. 1; theory 9.
     """
     if smoothness not in ("C0", "Lipschitz", "C1", "C2"):
         raise _error(f'`smoothness` must be "C0", "Lipschitz", "C1" or "C2", got {smoothness!r}')

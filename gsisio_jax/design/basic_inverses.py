@@ -1,6 +1,6 @@
 """All the left inverses of [G; H] that make input boxes exact, and the rows that tell whether there is an input at all.
 
-The rows are enumerated offline; online an exact bound is the best of a few products (design 4.5).
+The rows are enumerated offline; online an exact bound is the best of a few products (theory 7).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class BasicInverses(NamedTuple):
         complete: all basic rows are here, so the bound is exact. Otherwise it is correct, but may be wider.
         note: empty, or what is missing and why.
 
-    Source: design 4.5.
+    Source: theory 7.
     """
 
     rows: np.ndarray
@@ -47,7 +47,7 @@ class Circuits(NamedTuple):
         complete: a box of h that no circuit refutes is feasible for certain.
         note: empty, or what is missing and why.
 
-    Source: design 4.5.
+    Source: theory 7.
     """
 
     rows: np.ndarray
@@ -78,7 +78,7 @@ def basic_left_inverses(stacked: Any, free: Any = None, cap: int = 4096, width: 
     >>> basic_left_inverses([[1.0], [2.0]]).rows[:, 0].tolist()
     [[1.0, 0.0], [0.0, 0.5]]
 
-    Source: design 4.5; design 3, P13 (the paper's Lemma 3).
+    Source: theory 7; theory 2.13 (the paper's Lemma 3).
     """
     S, r = _extended("basic_left_inverses", stacked, free)
     p = S.shape[1]
@@ -124,7 +124,7 @@ def circuits(stacked: Any, free: Any = None, cap: int = 4096) -> Circuits:
     >>> (circuits([[1.0], [2.0], [0.0]]).rows + 0.0).round(6).tolist()
     [[0.0, 0.0, 1.0], [1.0, -0.5, 0.0]]
 
-    Source: design 4.5.
+    Source: theory 7.
     """
     S, r = _extended("circuits", stacked, free)
     zero = np.flatnonzero(~S.any(axis=1))

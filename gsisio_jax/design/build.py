@@ -105,7 +105,7 @@ def design_observer(
         NoDesignFound: no gain with finite boxes was found; says what failed and what may help.
         ValueError: shapes do not agree, or an argument is out of range.
 
-    Source: design 4.1, 4.2 and 4.4; paper, Theorem 1.
+    Source: theory 3, 4 and 6; paper, Theorem 1.
     """
     given, u_region = _check(system, noise, region, form, gains, u_region, sweeps)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS

@@ -28,7 +28,7 @@ class Feedthrough:
         current: matrix (p_H, l) with ``V1' d = current @ (y - g - D u - v)`` (paper, Lemma 4).
         note: empty, or what to know when H is not exactly of that rank as floating-point numbers.
 
-    Source: paper, Section III-A; design 2 and 4.1.
+    Source: paper, Section III-A; theory 1 and 3.
     """
 
     rank: int

@@ -1,7 +1,7 @@
 """Gains of the paper's Theorem 1, exactly as printed, for any left inverse of [G; H]. NumPy only.
 
 What is printed without a definition is supplied here: ``A_y = [K2 - L2; K2 - L2]``, and "K_{1:n}" means the first n
-columns. The existence condition is another matter: see `FramerGains.rho` and design 3, P1-P3.
+columns. The existence condition is another matter: see `FramerGains.rho` and theory 2.1-2.3.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class FramerGains(NamedTuple):
         rho: spectral radius of ``|G||J1|``; the recursion is a framer for all data only if it is below 1 (P3).
         guaranteed: it is, by a margin, and a nonnegative inverse of ``I - |G||J1|`` confirms it.
 
-    Source: paper, Theorem 1 and Lemma 3; design 3.
+    Source: paper, Theorem 1 and Lemma 3; theory 2.
     """
 
     J: Any
@@ -71,7 +71,7 @@ def framer_gains(system: System, left_inverse: Any = None) -> FramerGains:
     Raises:
         ValueError: `left_inverse` has the wrong shape or is no left inverse.
 
-    Source: paper, Theorem 1 (with A_y supplied, design 3, P7).
+    Source: paper, Theorem 1 (with A_y supplied, theory 2.7).
     """
     G, H, B, D = (np.asarray(matrix, dtype=np.float64) for matrix in (system.G, system.H, system.B, system.D))
     n = system.n

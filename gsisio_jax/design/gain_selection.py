@@ -70,7 +70,7 @@ def profile_bank(problem: GainProblem, main: np.ndarray, region: Interval, count
 def gains_for_missing(
     problem: GainProblem, main: np.ndarray, region: Interval, feedthrough: Feedthrough
 ) -> list[np.ndarray]:
-    """Gains for steps in which y[k-1] or entries of y[k] are missing (design 4.6)."""
+    """Gains for steps in which y[k-1] or entries of y[k] are missing (theory 8)."""
     l, q = problem.l, problem.q
     width = np.asarray(region.width)
     steady = problem.steady_width(main)

@@ -29,7 +29,7 @@ _SOLVER: dict[str, Any] = {
 def optimal_gain(problem: GainProblem, weight: np.ndarray, scale: np.ndarray) -> np.ndarray | None:
     """The gain whose steady width is componentwise smallest among all gains, or None if no gain contracts.
 
-    With a weight lambda per state and Y = diag(lambda) N everything is linear (design 4.2):
+    With a weight lambda per state and Y = diag(lambda) N everything is linear (theory 4):
 
         minimise 1'b(Y)  subject to  lambda' - 1'|Y_z| R - 1'A(lambda, Y) >= weight',   Y [H; C G] = diag(lambda) G.
 
@@ -63,7 +63,7 @@ def profile_gain(problem: GainProblem, width: np.ndarray, usable: np.ndarray, sc
     Returns:
         N (n, columns) with every row optimal, or None if the input cannot be cancelled with these measurements.
 
-    Source: design 4.2, "A bank of gains".
+    Source: theory 4.3.
     """
     inner = problem.scaled(scale)
     N = cp.Variable((inner.n, inner.columns))

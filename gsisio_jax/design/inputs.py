@@ -1,4 +1,4 @@
-"""Left inverses for the boxes of the unknown input (design 4.5).
+"""Left inverses for the boxes of the unknown input (theory 7).
 
 Two families: left inverses J of [G; H] applied to ``[x - f - B u - w; y - g - D u - v]``, and left inverses of the
 lifted rows [H; C G], which see the next output without going through the box of the next state. Each is chosen by a

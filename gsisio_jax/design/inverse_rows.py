@@ -2,7 +2,7 @@
 
 Every J with ``J [G; H] = I`` gives a correct box of the unknown input, and every row counts for itself. So a row more
 never harms and a row less never lies: numerical doubt is settled by dropping rows. What a row leaves of the equality is
-rounding only; the bounds online must account for it (design 6), because the unknown input is unbounded.
+rounding only; the bounds online must account for it (theory 10), because the unknown input is unbounded.
 """
 
 from __future__ import annotations

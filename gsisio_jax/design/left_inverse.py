@@ -38,7 +38,7 @@ def smallest_radius_inverse(G: Any, H: Any, margin: float = 1e-6) -> np.ndarray:
     >>> np.round(smallest_radius_inverse([[1.0]], [[2.0]]), 6).tolist()
     [[0.0, 0.5]]
 
-    Source: paper, Theorem 1; design 3, P3.
+    Source: paper, Theorem 1; theory 2.3.
     """
     G, H = np.asarray(G, dtype=np.float64), np.asarray(H, dtype=np.float64)
     if G.ndim != 2 or H.ndim != 2 or G.shape[1] != H.shape[1]:

@@ -90,7 +90,7 @@ def printed_lmi(contraction: float, n: int) -> LmiAnswer:
     >>> answer.feasible, answer.certificate_value > 0
     (False, True)
 
-    Source: paper, Theorem 2 (iii); design 3, P9.
+    Source: paper, Theorem 2 (iii); theory 2.9.
     """
     P, Gamma = cp.Variable((n, n), symmetric=True), cp.Variable((n, n), symmetric=True)
     eye, zero = np.eye(n), np.zeros((n, n))
@@ -132,7 +132,7 @@ def iss_lmi(contraction: float, n: int) -> LmiAnswer:
     >>> iss_lmi(0.5, 2).feasible, iss_lmi(1.5, 2).feasible
     (True, False)
 
-    Source: paper, proof of Theorem 2 (iii), repaired; design 3, P9.
+    Source: paper, proof of Theorem 2 (iii), repaired; theory 2.9.
     """
     if contraction >= 1:
         Z = np.kron(np.diag([1.0, 1.0, 0.0]), np.eye(n))

@@ -1,4 +1,4 @@
-"""Design of the prediction form: the paper's Theorem 1 with its missing condition, rho(|G||J1|) < 1 (design 3, P3)."""
+"""Design of the prediction form: the paper's Theorem 1 with its missing condition, rho(|G||J1|) < 1 (theory 2.3)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def design_prediction(
         FramerNotGuaranteed: rho(|G||J1|) >= 1 and `allow_uncertified` is not set.
         ValueError: `left_inverse` is unknown or no left inverse.
 
-    Source: paper, Theorem 1; design 3, P1-P3 and P6.
+    Source: paper, Theorem 1; theory 2.1-2.3 and 2.6.
     """
     if derivative is not None and derivative.shape != (system.n + system.l, system.n):
         raise ValueError(
@@ -104,7 +104,7 @@ def _reason(system: System, gains: FramerGains, left_inverse: Any) -> str:
     H = np.asarray(system.H)
     said = (
         f'design_observer: form="prediction" is no framer here: rho(|G||J1|) = {gains.rho:.4g}, and boxes are certain '
-        "only below 1 (design 3, P3). "
+        "only below 1 (docs/theory.md, section 2.3). "
     )
     if np.linalg.matrix_rank(H) < system.p:
         said += (

@@ -10,7 +10,7 @@ so on a region where ``df in F +- F_radius``, ``dg in E +- E_radius`` and ``|d p
 
 State bounds with two finite sides take part as pseudo-measurements: rows of the identity under C, known to within the
 width of the bound. Inputs with known bounds need no cancellation; what the gain leaves of them is noise.
-Source: design 4.1, 4.2 and 4.6.
+Source: theory 3, 4 and 8.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ def find_region(system: System, steady_width: Callable[[Interval], np.ndarray]) 
     Raises:
         NoDesignFound: no such region was met.
 
-    Source: design 4.4.
+    Source: theory 6.
     """
     center = np.asarray(system.state_bounds.center, dtype=np.float64)
     width = np.zeros(system.n)

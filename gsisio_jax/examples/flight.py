@@ -4,7 +4,7 @@ The target is a point in a conformal plane. Its acceleration is the unknown inpu
 assumed about the messages (ADS-B, table with one row per second, every column repeats its last value) is said here and
 in the comments of ``flight.toml``, with the figures that the noise bounds come from.
 
-Source: design 10, R1.
+Source: theory 12.7.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def system(speed_bound: float = 351.0) -> System:
         speed_bound: largest absolute component of the plane velocity [m/s]. The default is 350 m/s, which no airliner
             exceeds, times 1.0029, the plane's scale 430 km off its line (on the flight's own track it is below 1.0005).
 
-    Source: design 10, R1; design 4.6 (state bounds as pseudo-measurements).
+    Source: theory 12.7; theory 3.4 and 8.1.
     """
     free = np.full(2, np.inf)
     bound = np.concatenate([free, np.full(2, speed_bound)])

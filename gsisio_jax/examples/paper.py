@@ -1,6 +1,6 @@
 """The paper's example: the system as printed, and how its table of measurements was simulated.
 
-Source: paper, section "Illustrative Example"; design 10, S1.
+Source: paper, section "Illustrative Example"; theory 12.1.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Lower tanks 1 and 2 are fed by the upper tanks 3 and 4 and by two pumps, forward Euler with steps of one second. The
 pump flow may be off by any amount at any time, and the second sensor may be off by any amount: both are unknown inputs.
-Levels in cm, pump voltages and the offset in V. Source: design 10, S7.
+Levels in cm, pump voltages and the offset in V. Source: theory 12.5.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@
     tight(f)(box, *args)           Interval      exact where signs of df/dx are known, else the best of all
     bound(f, methods)(box, *args)  AffineForm    any choice of these, intersected (paper, Corollary 1)
 
-Source: design 5.
+Source: theory 9.
 """
 
 from gsisio_jax.inclusion.interpreter import register_bounds

@@ -1,6 +1,6 @@
 """Arithmetic of boxes and of the slopes of forms, rounded outward; and of numbers that are known while tracing.
 
-Source: design 5 and 6.
+Source: theory 9 and 10.
 """
 
 from __future__ import annotations

@@ -266,7 +266,7 @@ def register_bounds(name: str, natural: Callable[..., Interval], derivative: Cal
 
     The affine domain takes slope 0. Registered names come before the built-in table.
 
-    Source: design 5.
+    Source: theory 9.
     """
     if not callable(natural) or not (derivative is None or callable(derivative)):
         raise ValueError(f"register_bounds: `natural` and `derivative` for {name!r} must be functions of intervals")

@@ -62,7 +62,7 @@ def bound(
     Raises:
         ValueError: a method is unknown, or "abstraction" is asked for and none is given.
 
-    Source: paper, Corollary 1; design 5.
+    Source: paper, Corollary 1; theory 9.
     """
     chosen = check_methods("inclusion.bound", methods)
     if "abstraction" in chosen and abstraction is None:

@@ -47,7 +47,7 @@ def decomposition_gain(derivative: Interval) -> Any:
     Returns:
         Array (*out, n), nonnegative.
 
-    Source: paper, (eq:decompconstruct); design 5.
+    Source: paper, (eq:decompconstruct); theory 9.
     """
     a, b = derivative.lower, derivative.upper
     return jnp.where((a >= 0) | (b <= 0), 0, jnp.where(-a <= b, -a, b))
@@ -66,7 +66,7 @@ def width_gain(derivative: Interval) -> Any:
     Returns:
         Array (*out, n), nonnegative.
 
-    Source: design 3, P11 (the paper's Lemma 2 has one constant for all rows).
+    Source: theory 2.11 (the paper's Lemma 2 has one constant for all rows).
     """
     a, b = derivative.lower, derivative.upper
     return jnp.maximum(jnp.abs(a), jnp.abs(b)) + 2 * decomposition_gain(derivative)
@@ -93,7 +93,7 @@ def decomposition_function(
     >>> float(f_d(np.array([-1.0]), np.array([2.0]))), float(f_d(np.array([2.0]), np.array([-1.0])))
     (-5.0, 10.0)
 
-    Source: paper, Def. 3 and (eq:decompconstruct); design 5.
+    Source: paper, Def. 3 and (eq:decompconstruct); theory 9.
     """
     check_derivative("decomposition_function", derivative)
     if form not in ("cases", "optimal"):
@@ -152,7 +152,7 @@ def decomposition(
     >>> decomposition(lambda x: x[0] ** 2 - x[1], rounding="nearest")(Interval([-1.0, 0.0], [2.0, 1.0]))
     Interval(-6.0, 10.0)
 
-    Source: paper, Prop. 2 and (eq:decompconstruct); design 5.
+    Source: paper, Prop. 2 and (eq:decompconstruct); theory 9.
     """
     check_derivative("decomposition", derivative)
 
@@ -179,7 +179,7 @@ def remainder(f: Callable[..., Any], derivative: Any = None, rounding: Rounding 
     >>> [form(lambda x: jnp.abs(x[0]) - x[1], rounding="nearest")(box) for form in (decomposition, remainder)]
     [Interval(-4.0, 7.0), Interval(-2.0, 5.0)]
 
-    Source: Khajenejad and Yong, tight remainder-form decomposition functions; design 5.
+    Source: Khajenejad and Yong, tight remainder-form decomposition functions; theory 9.
     """
     check_derivative("remainder", derivative)
 
@@ -221,7 +221,7 @@ def tight(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | No
     >>> tight(pair, rounding="nearest")(Interval([-1.0, 0.0], [2.0, 1.0]))
     Interval([-1. -2.], [ 4. 10.])
 
-    Source: design 5; the center is that of Baumann, Optimal centered forms, BIT 28 (1988).
+    Source: theory 9; the center is that of Baumann, Optimal centered forms, BIT 28 (1988).
     """
     check_derivative("tight", derivative)
 

@@ -33,7 +33,7 @@ class Abstraction(eqx.Module):
             enclosure was proved.
         verified: "engine": the planes were proved by bounding f on sub-boxes; "sigma": by the smoothness class.
 
-    Source: paper, Prop. 1 and Cor. 1; design 5.
+    Source: paper, Prop. 1 and Cor. 1; theory 9.
     """
 
     region: Interval

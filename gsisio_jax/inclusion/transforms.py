@@ -29,7 +29,7 @@ class AffineForm(eqx.Module):
         offset: box of shape (*out).
         range: box of shape (*out), the natural bounds met with the affine ones at every node of f.
 
-    Source: design 5.
+    Source: theory 9.
     """
 
     slope: Float[Array, "*out n"]
@@ -61,7 +61,7 @@ def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable
     >>> natural(lambda x: jnp.sqrt(x[0]) - x[1], rounding="nearest")(Interval([0.0, 1.0], [4.0, 2.0]))
     Interval(-2.0, 1.0)
 
-    Source: design 5.
+    Source: theory 9.
     """
 
     @rounded_by("inclusion.natural", rounding)
@@ -88,7 +88,7 @@ def affine(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[
     >>> form.slope.tolist(), form.offset
     ([2.0, 0.0], Interval(-1.0, 1.0))
 
-    Source: design 5.
+    Source: theory 9.
     """
 
     @rounded_by("inclusion.affine", rounding)
@@ -110,7 +110,7 @@ def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callabl
     >>> jacobian(lambda x: jnp.abs(x[0]) + 3 * x[1], rounding="nearest")(Interval([-1.0, 0.0], [1.0, 1.0]))
     Interval([-1.  3.], [1. 3.])
 
-    Source: design 5.
+    Source: theory 9.
     """
 
     @rounded_by("inclusion.jacobian", rounding)
@@ -124,7 +124,7 @@ def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callabl
 def mean_value(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Mean-value form ``f(c) + J (box - c)`` around the center c of the box; arguments and errors as `natural`.
 
-    Source: design 5.
+    Source: theory 9.
     """
     at, slope = natural(f), jacobian(f)
 

@@ -57,7 +57,7 @@ class Interval(eqx.Module):
     >>> box.center.tolist(), box.width.tolist()
     ([0.0, 2.0], [2.0, 4.0])
 
-    Source: design 2; paper, Definition 1.
+    Source: theory 1; paper, Definition 1.
     """
 
     lower: Any

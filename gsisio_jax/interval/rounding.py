@@ -26,7 +26,7 @@ Gradients pass as if nothing had been widened: the widening is added as a consta
 
 `using("nearest")` switches all of it off while a function is traced, to compare speed; nothing is then guaranteed.
 
-Source: design 6.
+Source: theory 10.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ class Alarm:
         outputs: the outputs that enter that row, for kind "output".
         gap: by how much the two pieces miss each other, in the unit of the component.
 
-    Source: design 4.6.
+    Source: theory 8.
     """
 
     step: int

@@ -24,7 +24,7 @@ class LinearBounds(eqx.Module):
         known: (K, r, b).
         state: (K, r, n), or None where x[k] itself does not enter.
 
-    Source: design 4.1 (identity (*)) and 4.5.
+    Source: theory 3.1 (identity (*)) and 7.
     """
 
     residual: Any

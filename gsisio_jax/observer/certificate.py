@@ -33,7 +33,7 @@ class Certificate(eqx.Module):
         notes: what a reader should know besides.
         framer: the boxes are certain; False only for a prediction form that is none and was asked for all the same.
 
-    Source: design 4.2 and 4.4.
+    Source: theory 4 and 6.
     """
 
     region: Interval
@@ -82,7 +82,7 @@ class Certificate(eqx.Module):
         return self.certified and (not self.region_matters or bool((self.slack >= 0).all()))
 
     def noise_width(self, noise: Noise) -> Any:
-        """What one step adds to the width, b of design 4.2, (n,) or (T, n)."""
+        """What one step adds to the width, b of theory 4.1, (n,) or (T, n)."""
         return noise.w.width @ self.noise_w.T + noise.v.width @ self.noise_v.T + self.noise_fixed
 
     def next_width(self, width: Any, noise: Noise) -> Any:

@@ -1,4 +1,4 @@
-"""The certified bound: what keeps the width promise of a design, where boxes lie in its region (design 4.3, step 6)."""
+"""The certified bound: what keeps the width promise of a design, where boxes lie in its region (theory 5.6)."""
 
 from __future__ import annotations
 

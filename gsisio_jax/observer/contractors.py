@@ -48,7 +48,7 @@ def contract_affine_rows(states: States, form: Affine, z: Interval) -> tuple[Int
     Returns:
         Boxes (q, n) of x, and the slack (q,) of what the form reaches and z. Where a box misses that of x, so do these.
 
-    Source: design 4.3, step 4.
+    Source: theory 5.4.
     """
     slope, n = form.slope, states.center.shape[0]
     size = abs(slope)
@@ -91,7 +91,7 @@ def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, term
     Returns:
         Box (K, n) of x[k] for every gain; NaN where it overflowed.
 
-    Source: design 4.3, step 3.
+    Source: theory 5.3.
     """
     D, q, n = psi.slope, psi.slope.shape[0], psi.slope.shape[1]
     identity = jnp.eye(q, dtype=D.dtype)
@@ -164,7 +164,7 @@ def centred_form(
         terms: of a row, for rounding.
         left: (n, n), what `right` leaves of x by rounding.
 
-    Source: design 4.3, steps 3 and 6.
+    Source: theory 5.3 and 5.6.
     """
     middle, radius = center_and_radius(right, terms)
     before = clip(middle, within)

@@ -37,7 +37,7 @@ class Estimate(eqx.Module):
         guaranteed: the boxes hold on the machine, rounding included; False for ``rounding="nearest"`` and for the
             prediction form, whose boxes hold up to rounding errors (where they are framers at all).
 
-    Source: design 7 and 4.6.
+    Source: theory 8 and 11.
     """
 
     state: Interval
@@ -92,7 +92,7 @@ def estimate(
     Raises:
         ValueError: shapes do not agree, `u` is missing or not finite, `y` is infinite, or `on_conflict` is unknown.
 
-    Source: design 4.3 and 7.
+    Source: theory 5 and 11.
     """
     initial, y, u, noise, observer = prepare("estimate", observer, initial, y, u, noise, True, rounding)
     if length is not None:
@@ -124,7 +124,7 @@ def start(
     Returns:
         The carry for `step` (a pytree that can be saved), and a `StepOutput`.
 
-    Source: design 7.
+    Source: theory 11.
     """
     initial, y0, u0, noise, observer = prepare("start", observer, initial, y0, u0, noise, False, rounding)
     return _start(*fixed(observer), initial, y0, u0, noise, check_on_conflict("start", on_conflict))
@@ -153,7 +153,7 @@ def step(
     Returns:
         The next carry, and a `StepOutput`; its `input` is the box of d[k-1].
 
-    Source: design 7.
+    Source: theory 11.
     """
     box, y_k, u_k, noise, observer = prepare("step", observer, carry.state, y_k, u_k, noise, False, rounding)
     return _step(*fixed(observer), _as(carry, box.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))

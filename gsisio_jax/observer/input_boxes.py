@@ -1,4 +1,4 @@
-"""Boxes of the unknown input d[k-1], and what they say of the state (design 4.5)."""
+"""Boxes of the unknown input d[k-1], and what they say of the state (theory 7)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gsisio_jax.observer.types import Carry, Observer
 
 
 def from_inverses(maps: Maps, domain: Domain, states: States, fixed: Interval, psi: Affine) -> tuple[Interval, Domain]:
-    """Box of d[k-1] from every left inverse, given the box of x[k] (design 4.5)."""
+    """Box of d[k-1] from every left inverse, given the box of x[k] (theory 7)."""
     observer = maps.observer
     inverses, limits = observer.inverses, typed(observer.system.input_bounds, fixed.dtype)
     # state x[k] - remainder psi(x[k]) with psi = D x + [e], slopes combined before the box is applied.
@@ -76,7 +76,7 @@ def exact_input(
     believed: Any,
     new: Any = True,
 ) -> tuple[Interval, Domain]:
-    """The exact box of d[k-1] for ``[G; H] d in explained`` (paper, Lemma 3; design 4.5), and conflicts that it shows.
+    """The exact box of d[k-1] for ``[G; H] d in explained`` (paper, Lemma 3; theory 7), and conflicts that it shows.
 
     Args:
         observer: for its rows.

@@ -1,4 +1,4 @@
-"""How far bounds can be off because stored gains do not cancel exactly (design 6)."""
+"""How far bounds can be off because stored gains do not cancel exactly (theory 10)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """The prediction form: the paper's recursion (eq:xup)-(eq:hlow), with the box of x[k] from y[0..k-1] alone.
 
-It is a framer only where rho(|G||J1|) < 1 (design 3, P3), which no rank-deficient feedthrough allows. Elsewhere its
+It is a framer only where rho(|G||J1|) < 1 (theory 2.3), which no rank-deficient feedthrough allows. Elsewhere its
 boxes cross; then they bound nothing, every such step carries the status CROSSED, and the recursion goes on from the
 sorted corners.
 """

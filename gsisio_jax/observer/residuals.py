@@ -11,7 +11,7 @@ other (`contractors.CancellationResidual`). Fractions make these matrices exact,
 T2 annihilates the H of the declared rank. Where T2 times the H that was written is not exactly 0, the H of the promise
 is another one, within `H_slack` of it; that is accounted for as well.
 
-Source: design 4.1 and 6.
+Source: theory 3 and 10.
 """
 
 from __future__ import annotations

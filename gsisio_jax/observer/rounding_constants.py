@@ -2,7 +2,7 @@
 
 Everything here depends on the floating type, because gains are taken as the numbers they are in that type.
 
-Source: design 4.1, 4.3 and 6.
+Source: theory 3, 5 and 10.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _UP = 1 + 1e-12  # covers the rounding of a few float64 sums of nonnegative numb
 class Slopes(eqx.Module):
     """``df in F +- F_radius``, ``dg in E +- E_radius``, ``d(T2 g) in Z +- Z_radius`` on a box, jointly bounded.
 
-    Source: design 4.2.
+    Source: theory 4.
     """
 
     F: np.ndarray
@@ -100,7 +100,7 @@ def first_form(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64
     """Affine bounds of T2 g on the state bounds, uniformly over `u_region`, and the slack of their slope (q, n): every
     step begins with them.
 
-    Source: design 4.3, step 3.
+    Source: theory 5.3.
     """
     with _able_to_hold(dtype):
         matrix = jnp.asarray(np.asarray(T2), dtype)

@@ -13,7 +13,7 @@ import numpy as np
 class Status(enum.IntFlag):
     """Bit mask per step and batch element. OK is 0.
 
-    Source: design 4.6.
+    Source: theory 8.
     """
 
     OK = 0

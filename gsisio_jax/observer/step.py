@@ -1,4 +1,4 @@
-"""One step of the current form, from the box of x[k-1] to that of x[k] (design 4.3).
+"""One step of the current form, from the box of x[k-1] to that of x[k] (theory 5).
 
 `advance` is all there is: a start is a step whose past says nothing (`blank`), "hold" is the same step with y[k]
 missing. It is written over small arrays; `gsisio_jax.scalar` compiles it over single numbers.
@@ -58,7 +58,7 @@ def blank(observer: Observer, initial: Interval) -> Carry:
 
 @rounding.by_observer
 def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool = False) -> Any:
-    """One step of design 4.3. Arrays must have their final dtype.
+    """One step (theory 5). Arrays must have their final dtype.
 
     After a conflict the recursion goes on from a box that does not contain the contradiction: y[k] and the state bounds
     alone (restart), or the past alone, with y[k] taken as missing (`hold`).
@@ -162,7 +162,7 @@ def _predicted(
     maps: Maps, bank: LinearBounds, past: States, carry: Carry, known: Interval, ranges: bool = True
 ) -> Interval:
     """All terms of a bank but those in x[k], (K, r); slopes are combined before the box is applied, so that what
-    cancels cancels exactly: that is what keeps widths finite on nonlinear systems (design 4.3, step 2)."""
+    cancels cancels exactly: that is what keeps widths finite on nonlinear systems (theory 5.2)."""
     rows, shape = bank.residual.reshape(-1, bank.residual.shape[-1]), bank.residual.shape[:2]
     found = maps.rows(rows).bounds(past, carry.h) if ranges else maps.rows(rows).joint_box(past, carry.h)
     n = maps.observer.system.n

@@ -37,7 +37,7 @@ class InitialContraction(eqx.Module):
         linear: indices of the gains that `maps` belong to.
         affine_output: T2 g is affine on the state bounds.
 
-    Source: design 4.3, step 3, and 6.
+    Source: theory 5.3 and 10.
     """
 
     form: AffineForm | None
@@ -65,7 +65,7 @@ class RoundingConstants(eqx.Module):
         feedthrough: (l, p), how far the H of the promise may be from the one that is written.
         direct: indices of left inverses of [G; H] itself.
 
-    Source: design 6.
+    Source: theory 10.
     """
 
     gains: CancellationResidual
@@ -90,7 +90,7 @@ class ExactInputs(eqx.Module):
         circuits_known: (c, b), what they leave of the inputs with known bounds.
         complete: no basic row is missing (there may be too many), so the boxes are exact.
 
-    Source: design 4.5.
+    Source: theory 7.
     """
 
     rows: Any

@@ -83,7 +83,7 @@ def gsisio(
         derivative: box (n + l, n) that contains the derivative of [f; g] everywhere, for "decomposition" and
             "remainder", as the paper uses it; Lemma 2's constants then hold everywhere, too. None encloses it on every
             box, which is tighter, and on `region` for Lemma 2.
-        printed: width bounds by Lemma 2, Theorem 2 and Lemma 5 as printed (no bounds in general: design 3, P8-P11).
+        printed: width bounds by Lemma 2, Theorem 2 and Lemma 5 as printed (no bounds in general: theory 2.8-2.11).
         allow_uncertified: run the recursion where it is no framer. Boxes may then be crossed and miss the truth; the
             width bounds are those of the norm of |upper - lower|.
 
@@ -94,7 +94,7 @@ def gsisio(
         FramerNotGuaranteed: rho(|G||J1|) >= 1, so the boxes would be wrong, and `allow_uncertified` is not set.
         ValueError: shapes do not agree, or a derivative is not bounded on the region.
 
-    Source: paper, Algorithm 1; design 3.
+    Source: paper, Algorithm 1; theory 2.
     """
     given = [np.shape(matrix)[1] for matrix in (B, D) if matrix is not None and np.ndim(matrix) == 2]
     rows = np.shape(u)[-1] if u is not None and np.ndim(u) == 2 else None

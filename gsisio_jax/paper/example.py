@@ -42,7 +42,7 @@ FINDINGS = {
     "P12": "Some constants do not follow from the printed f and g.",
     "P13": "Lemma 3 is tight for square [G; H] only.",
 }
-"""What is wrong or missing in the paper, in words; P1 to P13 as in the design text of this library."""
+"""What is wrong or missing in the paper, in words; P1 to P13 as in docs/theory.md, section 2."""
 
 
 class Row(NamedTuple):
@@ -121,7 +121,7 @@ def numbers() -> list[Row]:
     Returns:
         One `Row` per number, in the order of print (epsilon is 0).
 
-    Source: paper, section "Illustrative Example"; design 3, P1, P5, P8, P11, P12.
+    Source: paper, section "Illustrative Example"; theory 2.1, 2.5, 2.8, 2.11 and 2.12.
     """
     system, everywhere = paper.system(), Interval.entire(2)
     constants = lipschitz_constants(system, everywhere)

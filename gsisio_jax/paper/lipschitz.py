@@ -38,7 +38,7 @@ class LipschitzConstants(NamedTuple):
         C_f, C_g: matrices of the decomposition functions, ``q_d(x, y) = q(z) + C_q (x - y)``; nonnegative.
         W_f, W_g: elementwise width gains, nonnegative; the corrected Lemma 2.
 
-    Source: paper, Lemma 2 and (eq:decompconstruct); design 3, P11.
+    Source: paper, Lemma 2 and (eq:decompconstruct); theory 2.11.
     """
 
     L_f: float
@@ -129,7 +129,7 @@ def lipschitz_constants(
     Raises:
         ValueError: a shape does not fit, `u_region` is missing, or a derivative is not bounded on the region.
 
-    Source: paper, Lemma 2; design 3, P11 and P12.
+    Source: paper, Lemma 2; theory 2.11 and 2.12.
     """
     u_region = check_region("lipschitz_constants", system, region, u_region)
     if derivative is None:

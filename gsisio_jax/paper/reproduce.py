@@ -95,7 +95,7 @@ class Reproduction(NamedTuple):
 def reproduce(steps: int = 60) -> Reproduction:
     """Compute everything: the table, the printed recursion and the current form on one record of `steps` steps.
 
-    Source: paper, section "Illustrative Example"; design 3 and 4.
+    Source: paper, section "Illustrative Example"; theory 2 and 3-8.
     """
     with jax.enable_x64(True):
         run = record(steps)

@@ -50,7 +50,7 @@ class Stability(NamedTuple):
         condition_i, condition_ii, condition_iii: printed: L <= 1, the matrix of (ii) is <= 0, (iii) is feasible.
             Corrected: L < 1, (ii) unchanged, the repaired (iii); (i) and (iii) also ask for `framer`.
 
-    Source: paper, Theorem 2; design 3, P8-P11.
+    Source: paper, Theorem 2; theory 2.8-2.11.
     """
 
     printed: bool
@@ -109,7 +109,7 @@ class Stability(NamedTuple):
 def width_matrices(G: Any, J: Any, printed: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """T_f and T_g from G (n, p) and a left inverse J (p, n + l) of [G; H].
 
-    Source: paper, Theorem 2; design 3, P8.
+    Source: paper, Theorem 2; theory 2.8.
     """
     G, J = np.asarray(G, np.float64), np.asarray(J, np.float64)
     return split_matrices(0.5 * (np.abs(G) @ np.abs(J) + G @ J), 0.5 * (np.abs(G) @ np.abs(J) - G @ J), printed)
@@ -125,7 +125,7 @@ def split_matrices(K: np.ndarray, L: np.ndarray, printed: bool = False) -> tuple
     >>> T_f.item(), T_g.item()
     (3.0, 1.0)
 
-    Source: paper, Theorem 2; design 3, P8.
+    Source: paper, Theorem 2; theory 2.8.
     """
     if K.shape != L.shape or K.ndim != 2 or K.shape[1] < K.shape[0]:
         raise ValueError(f"split_matrices: K and L must both have shape (n, n + l), got {K.shape} and {L.shape}")
@@ -186,7 +186,7 @@ def stability(
     Raises:
         ValueError: a shape does not fit, or a derivative is not bounded on the region.
 
-    Source: paper, Theorem 2; design 3, P8-P11.
+    Source: paper, Theorem 2; theory 2.8-2.11.
     """
     for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
         if box.shape != (size,):

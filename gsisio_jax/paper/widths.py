@@ -29,7 +29,7 @@ class WidthBounds(NamedTuple):
         state_elementwise, input_elementwise: (steps + 1, n) and (steps, p), corrected and tighter: no norms.
         state_elementwise_limit, input_elementwise_limit: (n,) and (p,), inf unless rho(growth) < 1.
 
-    Source: paper, Lemma 5; design 3, P10.
+    Source: paper, Lemma 5; theory 2.10.
     """
 
     state: np.ndarray
@@ -63,7 +63,7 @@ def width_bounds(stability: Stability, initial_width: Any, steps: int, printed: 
     Raises:
         ValueError: the width has the wrong shape or is negative or not finite, or `steps` is negative.
 
-    Source: paper, Lemma 5; design 3, P8 and P10.
+    Source: paper, Lemma 5; theory 2.8 and 2.10.
     """
     first = np.asarray(initial_width, np.float64)
     if first.shape != stability.noise_width.shape or not (np.isfinite(first).all() and (first >= 0).all()):

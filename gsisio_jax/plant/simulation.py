@@ -39,7 +39,7 @@ def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = N
     Raises:
         ValueError: shapes do not agree.
 
-    Source: paper, (eq:system); design 7.
+    Source: paper, (eq:system); theory 11.
     """
     x0, d = jnp.asarray(x0, float), jnp.asarray(d, float)
     if d.ndim != 2 or d.shape[1] != system.p:

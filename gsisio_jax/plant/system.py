@@ -36,7 +36,7 @@ class System(eqx.Module):
         ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
             the wrong shape, or a bound does not fit.
 
-    Source: paper, (eq:system); design 2.
+    Source: paper, (eq:system); theory 1.
     """
 
     f: Callable[..., Any] = eqx.field(static=True)
@@ -142,7 +142,7 @@ class Noise(eqx.Module):
     Raises:
         ValueError: a bound is infinite. (NaN and crossed bounds are refused by `Interval`.)
 
-    Source: paper, Section II; design 2.
+    Source: paper, Section II; theory 1.
     """
 
     w: Interval

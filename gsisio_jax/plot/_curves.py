@@ -44,7 +44,7 @@ def curves(
         ValueError: nothing was swept, or a name is not there.
         MissingExtra: matplotlib is not installed.
 
-    Source: design 7.
+    Source: theory 11.
     """
     style.require()
     dataset = prepared("curves", dataset)

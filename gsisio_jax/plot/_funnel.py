@@ -42,7 +42,7 @@ def funnel(
         ValueError: there are no boxes over time, a name is not there, or a shape does not agree.
         MissingExtra: matplotlib is not installed.
 
-    Source: design 7.
+    Source: theory 11.
     """
     style.require()
     tubes = read_tubes("funnel", dataset)

@@ -68,7 +68,7 @@ def heatmap(
             positive.
         MissingExtra: matplotlib is not installed.
 
-    Source: design 7.
+    Source: theory 11.
     """
     style.require()
     dataset = prepared("heatmap", dataset)

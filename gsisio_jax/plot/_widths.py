@@ -39,7 +39,7 @@ def widths(
             is of another system.
         MissingExtra: matplotlib is not installed.
 
-    Source: design 7.
+    Source: theory 11.
     """
     style.require()
     tubes = read_tubes("widths", dataset_or_estimate, certificate)

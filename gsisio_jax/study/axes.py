@@ -65,7 +65,7 @@ def grid(name: str, value: Any, coordinate: Any = None, unit: str = "") -> Axis:
     >>> grid("level", np.zeros((3, 2)), coordinate=[0.1, 0.2, 0.4], unit="m").name
     'level'
 
-    Source: design 7.
+    Source: theory 11.
     """
     if not isinstance(name, str) or not name or name in TAKEN:
         raise ValueError(f"grid: `name` must be a word other than {', '.join(TAKEN)}; got {name!r}")

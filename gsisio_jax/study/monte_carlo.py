@@ -106,7 +106,7 @@ def monte_carlo(
         ValueError: shapes or axes do not agree, a number is not legal, or a reduction is unknown.
         MissingExtra: xarray is not installed.
 
-    Source: design 2, 7 and 11.
+    Source: theory 1, 11 and 13.
     """
     need("xarray", extra="study", purpose="a Monte Carlo study")
     observer = checks.rounded(CALL, observer, rounding)

@@ -4,7 +4,7 @@ A tile counts once its marker is there. The marker is renamed into place after a
 other names, flushed to the disk and renamed. So whatever a killed run leaves behind is either a finished tile or
 nothing, and a resumed run ends in the dataset of an undisturbed one. No file is shared between two tiles: any number
 of processes may write at the same time. Zarr encodes the chunks and reads them (any Zarr reader can open the group); it
-does not write them, because its local store does not flush. Source: design 7, 8.
+does not write them, because its local store does not flush. Source: theory 11.2.
 """
 
 from __future__ import annotations

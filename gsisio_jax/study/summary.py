@@ -31,7 +31,7 @@ def summary(dataset: Any, dim: str = "run", confidence: float = 0.95) -> Any:
     Raises:
         ValueError: the axis is not there, or the confidence is not between 0 and 1.
 
-    Source: design 11.
+    Source: theory 13.
     """
     from scipy import stats
 

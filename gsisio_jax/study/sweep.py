@@ -90,7 +90,7 @@ def sweep(
         ValueError: shapes or axes do not agree, a number is not legal, or a reduction is unknown.
         MissingExtra: xarray is not installed.
 
-    Source: design 4.4 and 7.
+    Source: theory 6 and 11.
     """
     need("xarray", extra="study", purpose="a sweep")
     observer = checks.rounded(CALL, observer, rounding)

@@ -99,7 +99,7 @@ def allocate(
         ValueError: even the smallest bounds do not certify the required width, or an argument does not fit.
         NoDesignFound: no gain contracts, whatever the noise.
 
-    Source: design 4.2, 4.4.
+    Source: theory 4 and 6.
     """
     if not isinstance(region, Interval) or region.shape != (system.n,):
         raise ValueError(f"allocate: `region` must be an Interval of shape ({system.n},), got {region!r}")

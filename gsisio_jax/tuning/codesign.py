@@ -88,7 +88,7 @@ def optimal_widths(plant: Plant, theta: Any, u_region: Interval | None = None) -
     >>> slope.round(6).tolist()
     [[2.0]]
 
-    Source: design 4.2.
+    Source: theory 4.
     """
     try:
         system, noise, region = plant(theta)

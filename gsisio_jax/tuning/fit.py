@@ -73,7 +73,7 @@ def tune_noise(
             argument does not fit.
         MissingExtra: SciPy or optax is not installed.
 
-    Source: design 4.6.
+    Source: theory 8.
     """
     _check(observer, records, objective, method, tolerance, iterations)
     system = observer.system

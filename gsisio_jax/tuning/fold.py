@@ -60,7 +60,7 @@ def fold(
     Raises:
         ValueError: as `estimate`.
 
-    Source: design 4.3.
+    Source: theory 5.
     """
     initial, y, u, noise, observer = checks.prepare("fold", observer, initial, y, u, noise, rows=True)
     if length is not None:

@@ -2,7 +2,7 @@
 
 Bounds that are too small show in two ways only: a step finds an empty intersection (a conflict), or a logged truth lies
 outside its box. A conflict between measurements needs a combination of outputs that no unknown input reaches. The gain
-equation (design 4.1) has the rows [H; C G], as many as there are outputs; its rank is the number p of free inputs. With
+equation (theory 3) has the rows [H; C G], as many as there are outputs; its rank is the number p of free inputs. With
 l > p some combination ``N_y y[k-1] + N_z z[k]`` is free of the input and of known size. With l = p there is none: the
 rows are square and invertible, so for every y some input explains the step, however small the noise bounds are.
 """
@@ -37,7 +37,7 @@ def identify(call: str, system: System, truth: bool) -> Evidence:
     Raises:
         ValueError: they cannot.
 
-    Source: design 4.1, 4.5 (circuits).
+    Source: theory 3.2 and 7.2 (circuits).
     """
     width = np.asarray(system.input_bounds.width)
     free, outputs = int((~np.isfinite(width)).sum()), system.l

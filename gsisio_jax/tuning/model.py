@@ -27,7 +27,7 @@ def with_model(observer: Observer, system: System) -> Observer:
     Raises:
         ValueError: the systems differ in more than numbers of f and g, or the bounds use planes found offline.
 
-    Source: design 4.1, 4.2.
+    Source: theory 3 and 4.
     """
     old = observer.system
     for name in ("G", "H", "B", "D"):

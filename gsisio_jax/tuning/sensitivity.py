@@ -63,7 +63,7 @@ def width_sensitivity(
         ValueError: shapes do not agree, or `model` does not fit the observer.
         MissingExtra: xarray is not installed.
 
-    Source: design 4.4.
+    Source: theory 6.
     """
     xarray = need("xarray", extra="tune", purpose="a labelled table")
     if not isinstance(observer, Observer):

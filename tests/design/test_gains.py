@@ -35,7 +35,7 @@ def solved(request):
 
 
 def test_reference_widths_of_the_papers_example():
-    """Design 4.4: W = (1.65, 2.49) on [-1,1] x [-1.5,1.5], which fits; (1.51, 2.31) on [-1,1]^2, which does not."""
+    """Theory 6: W = (1.65, 2.49) on [-1,1] x [-1.5,1.5], which fits; (1.51, 2.31) on [-1,1]^2, which does not."""
     for region, expected in (((1.0, 1.5), (1.65, 2.49)), ((1.0, 1.0), (1.51, 2.31))):
         problem = problem_of(systems.s1(region=region))
         steady = problem.steady_width(optimal_gain(problem, np.ones(2), np.ones(2)))

@@ -79,7 +79,7 @@ def thousand():
 
 
 def test_input_boxes_equal_the_linear_programs(thousand):
-    """Design 4.5: the minimum over basic left inverses is the exact bound, infinite exactly where d is unbounded."""
+    """Theory 7: the minimum over basic left inverses is the exact bound, infinite exactly where d is unbounded."""
     cases, _, truth, lower, upper = thousand
     compared, infinite = 0, 0
     for k, ((S, _, _), hull) in enumerate(zip(cases, truth, strict=True)):

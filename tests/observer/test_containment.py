@@ -73,7 +73,7 @@ def test_zero_violations(name):
 
 @pytest.mark.parametrize("d_scale", [1.0, 1e3])
 def test_zero_violations_of_the_papers_example_in_200_000_steps(run_s1, d_scale):
-    """And the mean of the last widths (design 11): (1.229, 1.937) to within 5 %, at noise .2, gain of [-1,1]^2."""
+    """And the mean of the last widths (theory 13): (1.229, 1.937) to within 5 %, at noise .2, gain of [-1,1]^2."""
     found = run_s1(systems.s1(region=(1.0, 1.0)).design(missing=False, sweeps=3), 3400, d_scale=d_scale)
     check(*found)
     if d_scale == 1.0:
@@ -82,7 +82,7 @@ def test_zero_violations_of_the_papers_example_in_200_000_steps(run_s1, d_scale)
 
 @pytest.mark.parametrize("level", [0.2, 0.1, 0.02])
 def test_widths_keep_the_certificates_promise(run_s1, level):
-    """Design 4.4: where two successive boxes lie in the region, no step is wider than the recursion of the certificate.
+    """Theory 6: where two successive boxes lie in the region, no step is wider than the recursion of the certificate.
 
     Region [-1,1] x [-1.5,1.5] holds its steady width; d is small, so that boxes stay inside most of the time.
     """

@@ -1,6 +1,6 @@
 """Independent truth for boxes of the unknown input: linear programs solved by SciPy's HiGHS.
 
-Source: design 4.5; paper, Definition 4 (tightness: the box of all compatible inputs).
+Source: theory 7; paper, Definition 4 (tightness: the box of all compatible inputs).
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ and v+, so no sound observer that carries boxes only can return smaller state bo
 A lost message leaves the speed bound, and the position box grows at that speed: not at twice that, as it would if a
 box of the acceleration were computed first.
 
-Source: design 4.6 (joint elimination), 4.5 (basic left inverses).
+Source: theory 8.1 (joint elimination), 7.1 (basic left inverses).
 """
 
 from __future__ import annotations

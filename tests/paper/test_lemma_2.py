@@ -1,4 +1,4 @@
-"""Lemma 2: Lipschitz constants and width gains, as printed and as corrected; P11 and P12 of the design text."""
+"""Lemma 2: Lipschitz constants and width gains, as printed and as corrected; theory 2.11 and 2.12."""
 
 import full_rank_controls as controls
 import jax.numpy as jnp
@@ -64,7 +64,7 @@ def test_subdivision_closes_the_gap():
     fine = lipschitz_constants(case.system, case.region, case.u_region)
     assert fine.L_f_attained <= fine.L_f <= fine.L_f_attained * (1 + 1e-3)
     assert fine.L_f < norm_bound(np.asarray(fine.df.lower), np.asarray(fine.df.upper)) * (1 - 1e-4)
-    # Independent: the Jacobian as printed in design 10, at random points of the region.
+    # Independent: the Jacobian as printed in theory 12.1, at random points of the region.
     x = np.random.default_rng(0).uniform(case.region.lower, case.region.upper, (4000, 6))
     slope = 0.5 / np.sqrt(x)
     fast, slow = 0.5 * systems._S5, 0.5 * systems._S5 * systems._K5

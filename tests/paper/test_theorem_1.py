@@ -1,4 +1,4 @@
-"""What Theorem 1 of the paper really needs, computed: P1-P5 and P7 of design 3 (P13 is in tests/design)."""
+"""What Theorem 1 of the paper really needs, computed: theory 2.1-2.5 and 2.7 (P13 is in tests/design)."""
 
 from __future__ import annotations
 

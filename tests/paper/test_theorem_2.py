@@ -58,7 +58,7 @@ def test_no_condition_holds_on_the_systems_of_the_design(found):
 
 
 def test_references(found):
-    """rho of design 10 and P4, and the contraction constants measured."""
+    """rho of theory 12 and 2.4, and the contraction constants measured."""
     rho = {"s1": 1.927, "s2a": 0.081, "s2b": 0.0097, "s2c": 0.085, "s4a": 1.0, "s4b": 1.0, "s5": 1.0, "s7": 1.0}
     for name, value in rho.items():
         assert found[name][0].rho == pytest.approx(value, abs=5e-4)
@@ -70,7 +70,7 @@ def test_references(found):
 
 @pytest.mark.parametrize("name", CERTIFIED)
 def test_the_certificate_of_the_linear_program_beside_it(name, found):
-    """Where no condition of Theorem 2 holds, printed or corrected, the copositive certificate decides (design 4.2)."""
+    """Where no condition of Theorem 2 holds, printed or corrected, the copositive certificate decides (theory 4)."""
     certificate = CASES[name].design(gains=1, missing=False).certificate
     assert certificate.certified == CERTIFIED[name]
     assert not found[name][1].condition_i

@@ -24,7 +24,7 @@ every release of JAX). The largest errors seen on CPU with jax 0.10, in eps of t
 The margin is a factor of two where an error grows with the argument and is understood (a rounded factor of the
 exponent), and four or more elsewhere. sqrt is IEEE's. tan, arctan2 and logaddexp have 64, 16 and 512.
 
-Source: design 5 and 6.
+Source: theory 9 and 10.
 """
 
 from __future__ import annotations

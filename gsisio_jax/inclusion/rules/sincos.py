@@ -16,7 +16,7 @@ roundoff, for ``|t| < LIMIT``:
 Together ``4 u = 2 eps`` absolutely, and ``3 eps |t|`` for the sine (k = 0: relative; else ``|t| > 0.78``).
 Only the contraction of ``a b + c`` and nothing else may be rearranged, which holds without fast-math.
 
-Source: design 6 and 12.
+Source: theory 10.
 """
 
 from __future__ import annotations

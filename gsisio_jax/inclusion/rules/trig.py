@@ -1,6 +1,6 @@
 """Sine and cosine on an interval: exact ranges, and what is left after a slope is taken off.
 
-Source: design 5 and 6.
+Source: theory 9 and 10.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ extremes of ``phi(t) - (s + e) t`` over [a, b] lie among the points looked at, s
 the values there by at most ``|e| (b - a)``; that, the rounding of ``phi(t_i)`` and that of ``s t_i`` are what `_rest`
 adds.
 
-Source: design 5 and 6.
+Source: theory 9 and 10.
 """
 
 from __future__ import annotations
