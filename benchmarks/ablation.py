@@ -19,6 +19,8 @@ import numpy as np
 import gsisio_jax as gx
 from benchmarks.plants import from_tests
 from gsisio_jax.observer import step
+from gsisio_jax.observer.fixed import Fixed
+from gsisio_jax.scalar import ScalarProgram, scalar_program
 
 RUNS, SETTLED = 40, 10
 
@@ -58,7 +60,6 @@ def taken_out(names: dict[str, Callable[..., Any]]) -> Iterator[None]:
 def main(systems: list[str]) -> int:
     jax.config.update("jax_enable_x64", True)
     plants = from_tests("systems")
-    sizes = from_tests("sizes")
     for name in systems:
         plant = replace(plants.s4(True) if name == "s4" else getattr(plants, name)(), sweeps=3)
         run, _ = jax.jit(jax.vmap(plant.simulate))(jax.random.split(jax.random.key(0), RUNS))
@@ -69,10 +70,17 @@ def main(systems: list[str]) -> int:
         for what, changed, names in cases:
             with taken_out(names):
                 estimate = jax.jit(jax.vmap(lambda y, o=changed: gx.estimate(o, plant.initial, y, u)))(run.y)
-                count = sum(sizes.program(changed, plant).count().values())
+                count = sum(_program(changed, plant).count().values())
             x, d = (np.asarray(box.width)[:, SETTLED:].mean((0, 1)) for box in (estimate.state, estimate.input))
             print(f"{name:<4}{what:<36}{count:>8,}  x {_row(x)}  d {_row(d)}", flush=True)
     return 0
+
+
+def _program(observer: gx.Observer, plant: Any) -> ScalarProgram:
+    """One step over single numbers."""
+    constant, box = Fixed(observer).value, jax.tree.map(jnp.asarray, plant.initial)
+    args = step.blank(constant, box), jnp.zeros(plant.system.l), jnp.asarray(plant.u(1)[0]), plant.noise
+    return scalar_program(jax.make_jaxpr(lambda *a: step.advance(constant, *a))(*jax.tree.map(jnp.asarray, args)))
 
 
 def _row(values: np.ndarray) -> str:
