@@ -1,7 +1,7 @@
-"""`python -m benchmarks.ablation`: what every contractor of a step is worth, in width, and what it costs, in operations.
+"""`python -m benchmarks.ablation`: what every contractor of a step is worth in width, and what it costs in operations.
 
-Each is taken out by itself; runs are simulated, 40 of them, and widths averaged from step 10 on. A contractor that changes
-no width here may still be needed: the certified bound keeps the promise of the design, the exact rows of d its exactness.
+Each is taken out by itself; 40 simulated runs, widths averaged from step 10 on. A contractor that changes no width here
+may still be needed: the certified bound keeps the promise of the design, the exact rows of d its exactness.
 """
 
 from __future__ import annotations
@@ -62,18 +62,23 @@ def main(systems: list[str]) -> int:
     plants = from_tests("systems")
     for name in systems:
         plant = replace(plants.s4(True) if name == "s4" else getattr(plants, name)(), sweeps=3)
-        run, _ = jax.jit(jax.vmap(plant.simulate))(jax.random.split(jax.random.key(0), RUNS))
-        u = jnp.asarray(plant.u(plant.steps)) if plant.system.m else None
         observer = plant.design()
         cases = [(f"without {what}" if names else "all of it", observer, names) for what, names in TAKEN_OUT.items()]
         cases += [(f"{k} sweeps", replace(observer, sweeps=k), {}) for k in (1, 2, 4)]
         for what, changed, names in cases:
             with taken_out(names):
-                estimate = jax.jit(jax.vmap(lambda y, o=changed: gx.estimate(o, plant.initial, y, u)))(run.y)
-                count = sum(_program(changed, plant).count().values())
-            x, d = (np.asarray(box.width)[:, SETTLED:].mean((0, 1)) for box in (estimate.state, estimate.input))
-            print(f"{name:<4}{what:<36}{count:>8,}  x {_row(x)}  d {_row(d)}", flush=True)
+                print(f"{name:<4}{what:<36}{measured(changed, plant)}", flush=True)
     return 0
+
+
+def measured(observer: gx.Observer, plant: Any) -> str:
+    """Operations of a step, and mean widths."""
+    run, _ = jax.jit(jax.vmap(plant.simulate))(jax.random.split(jax.random.key(0), RUNS))
+    u = jnp.asarray(plant.u(plant.steps)) if plant.system.m else None
+    estimate = jax.jit(jax.vmap(lambda y: gx.estimate(observer, plant.initial, y, u)))(run.y)
+    count = sum(_program(observer, plant).count().values())
+    x, d = (np.asarray(box.width)[:, SETTLED:].mean((0, 1)) for box in (estimate.state, estimate.input))
+    return f"{count:>8,}  x {_row(x)}  d {_row(d)}"
 
 
 def _program(observer: gx.Observer, plant: Any) -> ScalarProgram:
