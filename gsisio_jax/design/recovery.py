@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.design.numpy_program import numpy_function
+from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.checks import prepare
 from gsisio_jax.observer.scan import advance, blank

@@ -30,6 +30,7 @@ from gsisio_jax.observer.residuals import (
     upper_inverse,
 )
 from gsisio_jax.observer.types import InitialContraction, Observer, RoundingConstants, cast
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 _UP = 1 + 1e-12  # covers the rounding of a few float64 sums of nonnegative numbers
 
@@ -64,19 +65,22 @@ class Slopes(eqx.Module):
 
 
 def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) -> Callable[[Interval], Slopes]:
-    """Enclosures of the Jacobians as a function of the box, uniformly over `u_box`; compiled once for all boxes, and
-    computed in that type whatever JAX is set to."""
+    """Enclosures of the Jacobians as a function of the box, uniformly over `u_box`; traced once for all boxes, run in
+    NumPy, and computed in that type whatever JAX is set to."""
 
-    # Compiled as one program: eager interval arithmetic would pay for every primitive apart.
-    @jax.jit
     def enclose(box: Interval, u: Interval) -> list[Interval]:
         T2_array = jnp.asarray(np.asarray(T2), dtype)
         maps = (system.dynamics, system.measurement, lambda x, u: T2_array @ system.measurement(x, u))
         return [inclusion.jacobian(q)(box, u) for q in maps]
 
+    program: list[Callable[..., list[Interval]]] = []
+
     def on(box: Interval) -> Slopes:
         with _able_to_hold(dtype):
-            parts = [_center_and_radius(jacobian) for jacobian in enclose(box.astype(dtype), u_box.astype(dtype))]
+            boxes = box.astype(dtype), u_box.astype(dtype)
+            if not program:
+                program.append(numpy_function(enclose, *boxes))
+            parts = [_center_and_radius(jacobian) for jacobian in program[0](*boxes)]
         return Slopes(*parts[0], *parts[1], *parts[2])
 
     return on
@@ -105,8 +109,9 @@ def first_form(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64
     with _able_to_hold(dtype):
         matrix = jnp.asarray(np.asarray(T2), dtype)
         bounds, u_box = system.state_bounds.astype(dtype), u_region.astype(dtype)
-        form, slack = jax.jit(affine_with_slack(lambda x, u: matrix @ system.measurement(x, u)))(bounds, u_box)
-        return jax.tree.map(np.array, form), np.array(slack, np.float64)
+        bound = affine_with_slack(lambda x, u: matrix @ system.measurement(x, u))
+        form, slack = numpy_function(bound, bounds, u_box)(bounds, u_box)
+        return form, np.asarray(slack, np.float64)
 
 
 def contracting_gains(N_z: np.ndarray, Q: np.ndarray, C: Any, everywhere: Slopes) -> list[np.ndarray | None]:

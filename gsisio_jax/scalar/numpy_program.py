@@ -1,7 +1,7 @@
 """A JAX function as a program of NumPy operations: for what runs a few times only, compiling takes all of the time.
 
-Operations that are not written here are given to JAX one at a time. So are transcendental functions if asked for:
-bounds of a function stand on the accuracy of the library that the observer runs on.
+Operations that are not written here are given to JAX one at a time. So are transcendental functions: bounds stand on
+the accuracy of the library that the observer runs on.
 """
 
 from __future__ import annotations
@@ -98,6 +98,8 @@ def _operation(eqn: Any) -> Callable[..., Sequence[Any]]:
     if name in _ARRAYS:
         rule = _ARRAYS[name]
         return lambda *args: (rule(params, *args),)
+    if name == "round" and int(params["rounding_method"]) == 1:  # to nearest, ties to even
+        return lambda x: (np.rint(x),)
     if name == "split":
         ends = np.cumsum(params["sizes"])[:-1]
         return lambda x: np.split(x, ends, axis=params["axis"])
