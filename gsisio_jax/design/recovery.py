@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.rounding_constants import known
 from gsisio_jax.observer.scan import advance, blank
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 
 def recovers(observer: Observer, width: np.ndarray, u_region: Interval) -> bool:
@@ -44,7 +44,7 @@ def recovers(observer: Observer, width: np.ndarray, u_region: Interval) -> bool:
             return False  # the nominal trajectory leaves the domain of f or g: nothing can be said for it
         rows[1] = np.full(system.l, np.nan)
         carry, box = numpy_function(lambda box: blank(observer, box), start)(start), start
-        step = numpy_function(lambda *args: advance(observer, *args, False), carry, rows[0], u, noise)
+        step = numpy_function(lambda c, y, u, noise: advance(observer, c, y, u, noise, False), carry, rows[0], u, noise)
         for y in rows:
             carry, out = step(carry, y, u, noise)
             box = out.state

@@ -63,7 +63,10 @@ class _Program:
         places: dict[Any, int] = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*fixed, *inputs], strict=True))
 
         def of(atom: Any) -> int:
-            return self.place(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, jex.Literal) else places[atom]
+            if not isinstance(atom, jex.Literal):
+                return places[atom]
+            kind: Any = atom.aval
+            return self.place(np.asarray(atom.val, kind.dtype))
 
         for eqn in jaxpr.eqns:
             operands = [of(atom) for atom in eqn.invars]
