@@ -1,4 +1,7 @@
-"""Offline design: gains, certificate, existence. With the co-design of `tuning` the only part that imports cvxpy."""
+"""Offline design: gains, certificate, existence. With the co-design of `tuning` the only part that solves programs.
+
+Small linear ones go to Clarabel directly; cvxpy is imported where it is first needed.
+"""
 
 from gsisio_jax.design.build import design_observer
 

@@ -13,7 +13,6 @@ import os
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-import cvxpy as cp
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -312,6 +311,8 @@ def _best_slopes(signs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.
 
 def _solve(signs: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(eq:abstraction) with sigma = 0, one program for many columns that share nothing but the vertices."""
+    import cvxpy as cp
+
     table = np.column_stack([signs, np.ones(len(signs))])
     above, below = (cp.Variable((table.shape[1], values.shape[1])) for _ in range(2))
     theta = cp.Variable((1, values.shape[1]))

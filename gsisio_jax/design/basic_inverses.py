@@ -10,7 +10,6 @@ from itertools import combinations
 from math import comb
 from typing import Any, NamedTuple
 
-import cvxpy as cp
 import numpy as np
 
 from gsisio_jax.design.gains import solve
@@ -195,6 +194,8 @@ def _fundamental(block: np.ndarray) -> np.ndarray:
 
 def _few(block: np.ndarray, width: np.ndarray) -> np.ndarray:
     """The pseudo-inverse and the rows of smallest width for a few width profiles: (p, number of rows, r)."""
+    import cvxpy as cp
+
     r, p = block.shape
     rows, columns = equilibration(block)
     J, profile = cp.Variable((p, r)), cp.Parameter(r, nonneg=True)

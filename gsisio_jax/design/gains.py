@@ -9,15 +9,14 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
-from cvxpy.error import SolverError
 
+from gsisio_jax.design.linear_program import Expression, LinearProgram, diagonal
 from gsisio_jax.design.problem import GainProblem
 
 _SPARSE = 1e-7  # scaled gain entries below this are the interior-point solver's noise
 _SOLVER: dict[str, Any] = {
-    "solver": cp.CLARABEL,
+    "solver": "CLARABEL",
     "tol_gap_abs": 1e-11,
     "tol_gap_rel": 1e-11,
     "tol_feas": 1e-11,
@@ -39,16 +38,15 @@ def optimal_gain(problem: GainProblem, weight: np.ndarray, scale: np.ndarray) ->
         scale: expected widths (n,), the units in which the program is solved.
     """
     inner = problem.scaled(scale)
-    lam = cp.Variable(inner.n, nonneg=True)
-    Y = cp.Variable((inner.n, inner.columns))
-    growth, noise, equality = _rows(inner, cp.diag(lam), Y, np.full(inner.columns, True))
-    # cvxpy needs the column sums as one vector expression: lambda' - 1'(...) >= c'.
-    margin = lam - cp.sum(growth, axis=0)
-    if not solve(cp.Problem(cp.Minimize(cp.sum(noise)), [margin >= weight, *equality])):
+    program = LinearProgram()
+    lam, Y = program.variable(inner.n), program.variable(inner.n, inner.columns)
+    growth, noise = _rows(program, inner, diagonal(lam), Y, np.full(inner.columns, True))
+    program.nonnegative(lam)
+    program.nonnegative(lam - growth.sum(axis=0) - weight)
+    found = program.minimise(noise.sum(), lam, Y)
+    if found is None or found[0].min() <= 0:
         return None
-    if lam.value is None or Y.value is None or lam.value.min() <= 0:
-        return None
-    return _finish(problem, inner, Y.value / lam.value[:, None], scale, np.full(inner.columns, True))
+    return _finish(problem, inner, found[1] / found[0][:, None], scale, np.full(inner.columns, True))
 
 
 def profile_gain(problem: GainProblem, width: np.ndarray, usable: np.ndarray, scale: np.ndarray) -> np.ndarray | None:
@@ -66,13 +64,12 @@ def profile_gain(problem: GainProblem, width: np.ndarray, usable: np.ndarray, sc
     Source: theory 4.3.
     """
     inner = problem.scaled(scale)
-    N = cp.Variable((inner.n, inner.columns))
-    growth, noise, equality = _rows(inner, np.eye(inner.n), N, usable)
+    program = LinearProgram()
+    N = program.variable(inner.n, inner.columns)
+    growth, noise = _rows(program, inner, np.eye(inner.n), N, usable)
     # Rows are independent: any positive combination of their costs has the same minimiser.
-    goal = cp.Problem(cp.Minimize(cp.sum(growth @ (width / scale)) + cp.sum(noise)), equality)
-    if not solve(goal) or N.value is None:
-        return None
-    return _finish(problem, inner, N.value, scale, usable)
+    found = program.minimise((growth @ (width / scale) + noise).sum(), N)
+    return None if found is None else _finish(problem, inner, found[0], scale, usable)
 
 
 def improve(problem: GainProblem, N: np.ndarray, rounds: int = 4) -> np.ndarray:
@@ -102,39 +99,35 @@ def improve(problem: GainProblem, N: np.ndarray, rounds: int = 4) -> np.ndarray:
     return N
 
 
-def _rows(inner: GainProblem, L: Any, Y: Any, usable: np.ndarray) -> tuple[Any, Any, list[Any]]:
-    """Expressions of diag(L) (A + |N_z| R), of diag(L) b, and the equality, all linear in (L, Y)."""
+def _rows(
+    program: LinearProgram, inner: GainProblem, L: Any, Y: Expression, usable: np.ndarray
+) -> tuple[Expression, Expression]:
+    """Expressions of diag(L) (A + |N_z| R) and of diag(L) b, linear in (L, Y); the equality becomes a constraint."""
     l, q = inner.l, inner.q
+    size = program.absolute
     Y_y, Y_z, Y_s = Y[:, :l], Y[:, l : l + q], Y[:, l + q :]
-    P = L - Y[:, l:] @ inner.C if inner.columns > l else L
-    N_yE = Y_y @ inner.E if l else np.zeros((inner.n, inner.n))
-    growth = cp.abs(P @ inner.F - N_yE)
-    noise = cp.abs(P) @ inner.dw
+    P = L - Y[:, l:] @ inner.C
+    growth = size(P @ inner.F - Y_y @ inner.E)
+    noise = size(P) @ inner.dw
     if inner.F_radius.any():
-        growth = growth + cp.abs(P) @ inner.F_radius
+        growth = growth + size(P) @ inner.F_radius
     if inner.E_radius.any():
-        growth = growth + cp.abs(Y_y) @ inner.E_radius
+        growth = growth + size(Y_y) @ inner.E_radius
     if inner.R.any():
-        growth = growth + cp.abs(Y_z) @ inner.R
-    if l:
-        noise = noise + cp.abs(Y_y) @ inner.dv
-    if q:
-        noise = noise + cp.abs(Y_z @ inner.T2) @ inner.dv
-    if len(inner.ds):
-        noise = noise + cp.abs(Y_s) @ inner.ds
-    constraints = []
-    residual = L @ inner.G - Y @ inner.seen if inner.G.shape[1] else None
-    if residual is not None and inner.free.any():
-        constraints.append(residual[:, np.flatnonzero(inner.free)] == 0)
-    if residual is not None and not inner.free.all():
-        noise = noise + cp.abs(residual[:, np.flatnonzero(~inner.free)]) @ inner.dd
-    if not usable.all():
-        constraints.append(Y[:, np.flatnonzero(~usable)] == 0)
-    return growth, noise, constraints
+        growth = growth + size(Y_z) @ inner.R
+    noise = noise + size(Y_y) @ inner.dv + size(Y_z @ inner.T2) @ inner.dv + size(Y_s) @ inner.ds
+    if inner.G.shape[1]:
+        residual = L @ inner.G - Y @ inner.seen
+        program.zero(residual[:, inner.free])
+        noise = noise + size(residual[:, ~inner.free]) @ inner.dd
+    program.zero(Y[:, ~usable])
+    return growth, noise
 
 
-def solve(goal: cp.Problem) -> bool:
-    """Solve a linear program with Clarabel; True where it claims a solution (which the caller checks)."""
+def solve(goal: Any) -> bool:
+    """Solve a problem of cvxpy with Clarabel; True where it claims a solution (which the caller checks)."""
+    from cvxpy.error import SolverError
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # "may be inaccurate": the result is checked, not believed
         try:

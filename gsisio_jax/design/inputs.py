@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple
 
-import cvxpy as cp
 import numpy as np
 
 from gsisio_jax.design.basic_inverses import basic_left_inverses, circuits
-from gsisio_jax.design.gains import solve
+from gsisio_jax.design.linear_program import Expression, LinearProgram
 from gsisio_jax.design.problem import GainProblem, without_rounding
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.types import ExactInputs
@@ -87,52 +86,49 @@ def _exact(problem: GainProblem, width: np.ndarray) -> tuple[ExactInputs, str]:
 def _direct(problem: GainProblem, width: np.ndarray, use_y: bool) -> np.ndarray | None:
     """J with ``J [G; H] = I`` in the columns of free inputs, smallest input width row by row."""
     n, p = problem.n, problem.G.shape[1]
-    J = cp.Variable((p, n + problem.l))
-    J1, J2 = J[:, :n], J[:, n:]
-    cost = (
-        cp.abs(J1) @ (width + problem.dw + problem.F_radius @ width) + cp.abs(J1 @ problem.F + J2 @ problem.E) @ width
-    )
-    cost = cost + cp.abs(J2) @ (problem.E_radius @ width + problem.dv)
+    program = LinearProgram()
+    J = program.variable(p, n + problem.l)
+    J1, J2, size = J[:, :n], J[:, n:], program.absolute
+    cost = size(J1) @ (width + problem.dw + problem.F_radius @ width)
+    cost = cost + size(J1 @ problem.F + J2 @ problem.E) @ width + size(J2) @ (problem.E_radius @ width + problem.dv)
     usable = np.concatenate([np.full(n, True), np.full(problem.l, use_y)])
-    return _solve(J, cost, np.vstack([problem.G, problem.H]), problem, usable)
+    return _solve(program, J, cost, np.vstack([problem.G, problem.H]), problem, usable)
 
 
 def _lifted(problem: GainProblem, width: np.ndarray, use_y: bool, use_measured: bool) -> np.ndarray | None:
     """L with ``L [H; C G] = I`` in the columns of free inputs."""
     l, q, p = problem.l, problem.q, problem.G.shape[1]
-    L = cp.Variable((p, problem.columns))
+    program = LinearProgram()
+    L, size = program.variable(p, problem.columns), program.absolute
     L_y, L_z, L_s = L[:, :l], L[:, l : l + q], L[:, l + q :]
     through = L[:, l:] @ problem.C
-    cost = cp.abs(L_y @ problem.E + through @ problem.F) @ width + cp.abs(through) @ (
-        problem.F_radius @ width + problem.dw
-    )
-    cost = cost + cp.abs(L_y) @ (problem.E_radius @ width + problem.dv)
-    if q:
-        cost = cost + cp.abs(L_z) @ (problem.R @ width) + cp.abs(L_z @ problem.T2) @ problem.dv
-    if len(problem.ds):
-        cost = cost + cp.abs(L_s) @ problem.ds
+    cost = size(L_y @ problem.E + through @ problem.F) @ width + size(through) @ (problem.F_radius @ width + problem.dw)
+    cost = cost + size(L_y) @ (problem.E_radius @ width + problem.dv)
+    cost = cost + size(L_z) @ (problem.R @ width) + size(L_z @ problem.T2) @ problem.dv + size(L_s) @ problem.ds
     usable = np.concatenate([np.full(l, use_y), np.full(q, use_measured), np.full(len(problem.ds), True)])
-    return _solve(L, cost, problem.seen, problem, usable)
+    return _solve(program, L, cost, problem.seen, problem, usable)
 
 
 def _solve(
-    J: cp.Variable, cost: cp.Expression, stacked: np.ndarray, problem: GainProblem, usable: np.ndarray
+    program: LinearProgram,
+    J: Expression,
+    cost: Expression,
+    stacked: np.ndarray,
+    problem: GainProblem,
+    usable: np.ndarray,
 ) -> np.ndarray | None:
     p = problem.G.shape[1]
     gap = np.eye(p) - J @ stacked
-    free, bounded = np.flatnonzero(problem.free), np.flatnonzero(~problem.free)
-    constraints = []
-    if len(free):
-        constraints.append(gap[:, free] == 0)
-    if len(bounded):
-        cost = cost + cp.abs(gap[:, bounded]) @ problem.dd
-    if not usable.all():
-        constraints.append(J[:, np.flatnonzero(~usable)] == 0)
+    free = np.flatnonzero(problem.free)
+    program.zero(gap[:, free])
+    program.zero(J[:, ~usable])
+    cost = cost + program.absolute(gap[:, ~problem.free]) @ problem.dd
     # Rows are independent; divide by the size of a unit input so that inputs of any unit count alike.
     weights = np.abs(stacked).max(axis=0)
-    if not solve(cp.Problem(cp.Minimize(weights @ cost), constraints)) or J.value is None:
+    values = program.minimise(cost @ weights, J)
+    if values is None:
         return None
-    found = np.where((np.abs(J.value) > 1e-9 * np.abs(J.value).max()) & usable, J.value, 0.0)
+    found = np.where((np.abs(values[0]) > 1e-9 * np.abs(values[0]).max()) & usable, values[0], 0.0)
     for i in range(p):  # restore the equality on the entries that are left
         rows = np.flatnonzero(found[i])
         for _ in range(2):

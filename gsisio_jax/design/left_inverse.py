@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import cvxpy as cp
 import numpy as np
 
 from gsisio_jax.design.gains import solve
@@ -40,6 +39,8 @@ def smallest_radius_inverse(G: Any, H: Any, margin: float = 1e-6) -> np.ndarray:
 
     Source: paper, Theorem 1; theory 2.3.
     """
+    import cvxpy as cp
+
     G, H = np.asarray(G, dtype=np.float64), np.asarray(H, dtype=np.float64)
     if G.ndim != 2 or H.ndim != 2 or G.shape[1] != H.shape[1]:
         raise ValueError(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import cvxpy as cp
 import numpy as np
 
 from gsisio_jax.design.gains import solve
@@ -92,6 +91,8 @@ def printed_lmi(contraction: float, n: int) -> LmiAnswer:
 
     Source: paper, Theorem 2 (iii); theory 2.9.
     """
+    import cvxpy as cp
+
     P, Gamma = cp.Variable((n, n), symmetric=True), cp.Variable((n, n), symmetric=True)
     eye, zero = np.eye(n), np.zeros((n, n))
     block = cp.bmat([[P + Gamma - eye, zero, P], [zero, contraction**2 * eye - P, zero], [P, zero, P]])
@@ -134,6 +135,8 @@ def iss_lmi(contraction: float, n: int) -> LmiAnswer:
 
     Source: paper, proof of Theorem 2 (iii), repaired; theory 2.9.
     """
+    import cvxpy as cp
+
     if contraction >= 1:
         Z = np.kron(np.diag([1.0, 1.0, 0.0]), np.eye(n))
         value = refutation(Z, contraction, printed=False) / (2 * n)

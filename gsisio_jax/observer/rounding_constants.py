@@ -19,7 +19,8 @@ import numpy as np
 
 from gsisio_jax import inclusion
 from gsisio_jax.inclusion.transforms import AffineForm, affine_with_slack
-from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, cast_down, cast_up
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.residuals import (
     cancellation_residual,
@@ -30,6 +31,7 @@ from gsisio_jax.observer.residuals import (
     upper_inverse,
 )
 from gsisio_jax.observer.types import InitialContraction, Observer, RoundingConstants, cast
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 _UP = 1 + 1e-12  # covers the rounding of a few float64 sums of nonnegative numbers
 
@@ -64,22 +66,32 @@ class Slopes(eqx.Module):
 
 
 def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) -> Callable[[Interval], Slopes]:
-    """Enclosures of the Jacobians as a function of the box, uniformly over `u_box`; compiled once for all boxes, and
-    computed in that type whatever JAX is set to."""
+    """Enclosures of the Jacobians as a function of the box, uniformly over `u_box`; traced once for all boxes, run in
+    NumPy, and computed in that type whatever JAX is set to."""
 
-    # Compiled as one program: eager interval arithmetic would pay for every primitive apart.
-    @jax.jit
     def enclose(box: Interval, u: Interval) -> list[Interval]:
         T2_array = jnp.asarray(np.asarray(T2), dtype)
         maps = (system.dynamics, system.measurement, lambda x, u: T2_array @ system.measurement(x, u))
         return [inclusion.jacobian(q)(box, u) for q in maps]
 
+    program: list[Callable[..., list[Interval]]] = []
+
     def on(box: Interval) -> Slopes:
         with _able_to_hold(dtype):
-            parts = [_center_and_radius(jacobian) for jacobian in enclose(box.astype(dtype), u_box.astype(dtype))]
+            boxes = known(box, dtype), known(u_box, dtype)
+            if not program:
+                program.append(numpy_function(enclose, *boxes))
+            parts = [_center_and_radius(jacobian) for jacobian in program[0](*boxes)]
         return Slopes(*parts[0], *parts[1], *parts[2])
 
     return on
+
+
+def known(box: Interval, dtype: Any) -> Interval:
+    """`Interval.astype` in NumPy: JAX would compile each of its operations by itself."""
+    lower, upper = (np.asarray(side) for side in (box.lower, box.upper))
+    sides = np.asarray(cast_down(lower, dtype)), np.asarray(cast_up(upper, dtype))
+    return Interval.unchecked(*rounding.normal(*sides))
 
 
 def _able_to_hold(dtype: Any) -> Any:
@@ -104,9 +116,10 @@ def first_form(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64
     """
     with _able_to_hold(dtype):
         matrix = jnp.asarray(np.asarray(T2), dtype)
-        bounds, u_box = system.state_bounds.astype(dtype), u_region.astype(dtype)
-        form, slack = jax.jit(affine_with_slack(lambda x, u: matrix @ system.measurement(x, u)))(bounds, u_box)
-        return jax.tree.map(np.array, form), np.array(slack, np.float64)
+        bounds, u_box = known(system.state_bounds, dtype), known(u_region, dtype)
+        bound = affine_with_slack(lambda x, u: matrix @ system.measurement(x, u))
+        form, slack = numpy_function(bound, bounds, u_box)(bounds, u_box)
+        return form, np.asarray(slack, np.float64)
 
 
 def contracting_gains(N_z: np.ndarray, Q: np.ndarray, C: Any, everywhere: Slopes) -> list[np.ndarray | None]:

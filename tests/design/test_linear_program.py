@@ -1,0 +1,94 @@
+"""The small modelling layer over Clarabel against the simplex, and programs run in NumPy against compiled ones."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import systems
+from scipy import optimize
+
+from gsisio_jax import Interval, estimate
+from gsisio_jax.design import build
+from gsisio_jax.design.linear_program import LinearProgram, diagonal
+from gsisio_jax.scalar.numpy_program import numpy_function
+
+
+def test_absolute_values_and_equalities_against_the_simplex():
+    """min w'|X A - B| u over X with X c = d: row by row a linear program in (x, t)."""
+    rng = np.random.default_rng(0)
+    A, B, c, d, w, u = (rng.normal(size=s) for s in ((3, 5), (2, 5), (3, 1), (2, 1), (2,), (5,)))
+    w, u = abs(w), abs(u)
+    program = LinearProgram()
+    X = program.variable(2, 3)
+    program.zero(X @ c - d)
+    found = program.minimise((program.absolute(X @ A - B) @ u) @ w, X)
+    assert found is not None
+    best = 0.0
+    for i in range(2):
+        rows = np.block([[A.T, -np.eye(5)], [-A.T, -np.eye(5)]])
+        answer = optimize.linprog(
+            np.concatenate([np.zeros(3), w[i] * u]), rows, np.concatenate([B[i], -B[i]]),
+            np.concatenate([c[:, 0], np.zeros(5)])[None], d[i], bounds=(None, None),
+        )  # fmt: skip
+        best += answer.fun
+    np.testing.assert_allclose(found[0] @ c, d, atol=1e-9)
+    np.testing.assert_allclose(w @ np.abs(found[0] @ A - B) @ u, best, rtol=1e-8)
+
+
+def test_expressions_are_their_values():
+    rng = np.random.default_rng(1)
+    M, K, x = rng.normal(size=(3, 2)), rng.normal(size=(4, 3)), np.array([1.0, -2.0, 3.0])
+    program = LinearProgram()
+    v, Y = program.variable(3), program.variable(4, 3)
+    program.zero(v - x)
+    program.zero(Y - K)
+    every = (diagonal(v) @ M - M, (K - Y)[:, 1:] @ M[1:], Y.sum(axis=0) + v, Y[:, [2, 0]], Y[:, 3:] @ M[:0], -v.sum())
+    values = program.minimise(v.sum(), *every)
+    assert values is not None
+    expected = (np.diag(x) @ M - M, np.zeros((4, 2)), K.sum(axis=0) + x, K[:, [2, 0]], np.zeros((4, 2)), -x.sum())
+    for value, wanted in zip(values, expected, strict=True):
+        np.testing.assert_allclose(value, wanted, atol=1e-8)
+
+
+def test_no_minimum():
+    program = LinearProgram()
+    x = program.variable(2)
+    program.nonnegative(x)
+    assert program.minimise(-x.sum(), x) is None
+    program.nonnegative(-x - np.ones(2))
+    assert program.minimise(x.sum(), x) is None
+
+
+def test_a_numpy_program_gives_what_jax_gives():
+    def function(x, i):
+        rows = jnp.stack([jnp.sin(x), jnp.where(x > 0, x, jnp.inf), jnp.round(x), x**3, jnp.cumsum(x)])
+        table = jnp.einsum("ij,kj->ik", rows[2:], rows[2:]) + jnp.arange(3.0)
+        best = jnp.max(rows, axis=0), jnp.argmin(rows, axis=1), jnp.sort(x)[::-1], rows.sum(), rows.T[i]
+        return table, best, jax.lax.fori_loop(0, 3, lambda k, a: a * x[k], 1.0), jax.nn.softplus(x), i // 2, -7 // i
+
+    x, i = jnp.array([0.5, -1.5, 2.5, 3.0]), jnp.asarray(3)
+    program, compiled = numpy_function(function, x, i), jax.jit(function)
+    for values in (x, -2 * x, x.at[1].set(jnp.nan)):
+        mine, wanted = program(values, i), compiled(values, i)
+        assert jax.tree.structure(mine) == jax.tree.structure(wanted)
+        for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(wanted), strict=True):
+            assert isinstance(a, np.ndarray)
+            assert a.dtype == b.dtype
+            np.testing.assert_allclose(a, b, rtol=1e-13)
+
+
+@pytest.mark.parametrize("case", [systems.s1(), systems.s5()])
+def test_the_trial_of_a_lost_row_is_that_of_the_compiled_observer(case):
+    observer = case.design()
+    system, center = case.system, np.asarray(case.region.center)
+    width = np.full(system.n, 0.01)
+    u = np.zeros(0) if case.u_region is None else np.asarray(case.u_region.center)
+    x, rows = jnp.asarray(center), []
+    for _ in range(system.n + 5):
+        rows.append(np.asarray(system.measurement(x, u)))
+        x = system.dynamics(x, u)
+    rows[1] = np.full(system.l, np.nan)
+    initial = Interval(center - width / 2, center + width / 2)
+    last = estimate(observer, initial, np.array(rows), np.tile(u, (len(rows), 1))).state[-1]
+    finite = bool(np.isfinite(last.lower).all() and np.isfinite(last.upper).all())
+    assert build.recovers(observer, width, Interval(u, u)) is finite is observer.certificate.recoverable
