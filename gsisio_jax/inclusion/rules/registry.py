@@ -68,10 +68,6 @@ def _plain(fn: Callable[..., Any]) -> Rule:
     return lambda eqn, *args: fn(*args)
 
 
-def _swapped(fn: Callable[..., Any]) -> Rule:
-    return lambda eqn, x, y: fn(y, x)
-
-
 def _same(eqn: Any) -> bool:
     """Are the two operands one and the same variable?"""
     x, y = eqn.invars
