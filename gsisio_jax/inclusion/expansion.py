@@ -16,14 +16,14 @@ products and sums are each off by eps of a term of T, N + 4 times at most for ea
 its own. For ranges the same with ``|range_j|`` in the place of q_j. Flushed numbers lose less than ``2^60 tiny``, see
 `rounding.generous`; that is added to every offset and state.
 
-**Atoms of atoms.** An argument t is such a row, too: ``t = s_t x + c_t +- r_t`` with the magnitude
-``T = sum |w_i| m_i + sum |w_j| q_j + |c|``, and its bounds are off by ``kappa T`` at most. A curve with the line
-``|phi(t) - s t - middle| <= half`` on the range of t (`univariate.Line`), ``|phi| <= size``, has the slope
-``s s_t``, the center ``s c_t + middle`` and the radius ``|s| r_t + half``, and its q is below ``3 |s| T + size``: one
-``kappa |s| T`` for the argument and one kappa q for the rows. So radii are widened by ``(ulps + 4 kappa) (size + |s|
-T)``, with ulps for the line. What is flushed to zero in t counts |s| times: T is made ``tiny / eps`` larger, which is more. A product has
-``cy s_x + cx s_y``, ``|cx| <= T_x`` and so on: its q is below ``4 T_x T_y``, and it is widened by
-``(ulps + 8 kappa) T_x T_y``.
+**Atoms of atoms.** An argument t is such a row, too: ``t = s_t x + c_t +- r_t`` with the magnitude ``T = sum |w_i|
+m_i + sum |w_j| q_j + |c|``, and its bounds are off by ``kappa T`` at most. A curve with the line ``|phi(t) - s t -
+middle| <= half`` on the range of t (`univariate.Line`), ``|phi| <= size``, has the slope ``s s_t``, the center ``s
+c_t + middle`` and the radius ``|s| r_t + half``, and its q is below ``3 |s| T + size``: one ``kappa |s| T`` for the
+argument and one kappa q for the rows. So radii are widened by ``(ulps + 4 kappa) (size + |s| T)``, with ulps for the
+line. What is flushed to zero in t counts |s| times: T is made ``tiny / eps`` larger, which is more. A product has
+``cy s_x + cx s_y``, ``|cx| <= T_x`` and so on: its q is below ``4 T_x T_y``, and it is widened by ``(ulps + 8 kappa)
+T_x T_y``.
 """
 
 from __future__ import annotations

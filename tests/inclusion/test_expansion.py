@@ -135,7 +135,8 @@ def _misses(dtype, mode: str) -> list[str]:
                 if value is None:
                     continue
                 center, radius, low, high, least, most = (r[k, j] for r in results)
-                assert not np.isnan([center, low, high, least, most]).any() and radius >= 0
+                assert not np.isnan([center, low, high, least, most]).any()
+                assert radius >= 0
                 joint = mp.inf if np.isinf(radius) else mp.mpf(float(radius))
                 right = abs(value - mp.mpf(float(center))) <= joint
                 right = right and low <= value <= high and least <= value <= most
@@ -187,7 +188,8 @@ def test_weights_that_cancel(dtype):
                 exact = mp.fsum(mp.mpf(w) * v for w, v in zip(row, values, strict=True) if w)
                 center, radius, low, high, least, most = (v[k, r] for v in results)
                 assert np.isinf(radius) or abs(exact - mp.mpf(float(center))) <= mp.mpf(float(radius)), (r, lower[k])
-                assert low <= exact <= high and least <= exact <= most, (r, lower[k], upper[k])
+                assert low <= exact <= high, (r, lower[k], upper[k])
+                assert least <= exact <= most, (r, lower[k], upper[k])
                 checked += 1
     assert checked > 500
 
@@ -221,7 +223,8 @@ def test_no_wider_than_by_the_rules_of_the_engine():
     ):
         for k in np.flatnonzero(usual | far):
             size = 1e-11 * (1 + sum(abs(side) for side in (old_low[k], old_high[k]) if np.isfinite(side)))
-            assert low[k] >= old_low[k] - size and high[k] <= old_high[k] + size, (atom.name, lower[k], upper[k])
+            assert low[k] >= old_low[k] - size, (atom.name, lower[k], upper[k])
+            assert high[k] <= old_high[k] + size, (atom.name, lower[k], upper[k])
             if usual[k]:
                 width = np.sum(abs(slope[k]) * half[k]) + radius[k]
                 before = np.sum(abs(old_slope[k]) * half[k]) + old_radius[k]
@@ -243,8 +246,8 @@ def test_gradients_are_finite(dtype):
             every = jnp.concatenate(every)
             return jnp.where(jnp.isfinite(every), every, 0)
 
-    backward = np.asarray(jax.jit(jax.vmap(jax.jacrev(outputs)))(jnp.stack([lower, upper], 1)))
-    assert np.isfinite(backward).all(), np.argwhere(~np.isfinite(backward))[:5]
+    gradient = np.asarray(jax.jit(jax.vmap(jax.grad(lambda sides: outputs(sides).sum())))(jnp.stack([lower, upper], 1)))
+    assert np.isfinite(gradient).all(), [(lower[k], upper[k]) for k in np.argwhere(~np.isfinite(gradient))[:5, 0]]
 
 
 def _hard(dtype) -> np.ndarray:
@@ -257,7 +260,7 @@ def _hard(dtype) -> np.ndarray:
     wide = random.uniform(-1, 1, 60) * 10 ** random.uniform(-12, np.log10(limit) - 0.01, 60)
     edge = [np.nextafter(dtype(limit), dtype(0)), -np.nextafter(dtype(limit), dtype(0)), 1e-30, -1e-35, 0, np.pi / 4]
     found = np.concatenate([near, wide.astype(dtype), np.array(edge, dtype)]).astype(dtype)
-    return found[np.abs(found) < limit]
+    return found[(np.abs(found) < limit) & ((found == 0) | (np.abs(found) >= np.finfo(dtype).tiny))]
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)
@@ -307,7 +310,8 @@ def test_wave_atoms(dtype, cosine):
 
 def test_what_is_linear_costs_nothing():
     found = expand(lambda x, u: jnp.stack([x[0] / 4 + 2 * x[1] - 3, x[0] - x[0], jnp.float64(2.0)]), 2, 0, np.float64)
-    assert found is not None and found.atoms == []
+    assert found is not None
+    assert found.atoms == []
     first, second, third = found.outputs
     assert (first.coefficients, first.constant) == ({0: 0.25, 1: 2}, -3)
     assert (second.coefficients, second.constant, third.coefficients, third.constant) == ({}, 0, {}, 2)
