@@ -248,8 +248,8 @@ def test_gradients_are_finite(dtype):
             every = jnp.concatenate(every)
             return jnp.where(jnp.isfinite(every), every, 0)
 
-    backward = np.asarray(jax.jit(jax.vmap(jax.jacrev(outputs)))(jnp.stack([lower, upper], 1)))
-    assert np.isfinite(backward).all(), np.argwhere(~np.isfinite(backward))[:5]
+    gradient = np.asarray(jax.jit(jax.vmap(jax.grad(lambda sides: outputs(sides).sum())))(jnp.stack([lower, upper], 1)))
+    assert np.isfinite(gradient).all(), [(lower[k], upper[k]) for k in np.argwhere(~np.isfinite(gradient))[:5, 0]]
 
 
 def _hard(dtype) -> np.ndarray:
@@ -262,7 +262,7 @@ def _hard(dtype) -> np.ndarray:
     wide = random.uniform(-1, 1, 60) * 10 ** random.uniform(-12, np.log10(limit) - 0.01, 60)
     edge = [np.nextafter(dtype(limit), dtype(0)), -np.nextafter(dtype(limit), dtype(0)), 1e-30, -1e-35, 0, np.pi / 4]
     found = np.concatenate([near, wide.astype(dtype), np.array(edge, dtype)]).astype(dtype)
-    return found[np.abs(found) < limit]
+    return found[(np.abs(found) < limit) & ((found == 0) | (np.abs(found) >= np.finfo(dtype).tiny))]
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)

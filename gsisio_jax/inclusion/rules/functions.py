@@ -416,7 +416,7 @@ def _cube_line(a: Any, b: Any, kappa: float) -> Line:
 
 
 def _bend_line(curve: Curve) -> Callable[[Any, Any, float], Line]:
-    """Of a function that rises from one number to another and bends at 0, where it is ``center``; as `Curve.line`.
+    """As `Curve.line`, of a function that rises between two numbers and bends at 0, where it is ``center``.
 
     ``phi - s t`` has a maximum at m and a minimum at -m. s is the derivative at m but for some ulps, so the extremes
     are off by ``ulps eps s (b - a)`` and the ulps of phi, and by six roundings.
