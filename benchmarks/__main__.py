@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 # As the command line of the library sets them, unless the user has; before JAX is imported.
-XLA_FLAGS = "--xla_cpu_prefer_vector_width=512 --xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
+XLA_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
 RESULTS = Path(__file__).resolve().parent / "results"
 SIZES = {  # full, quick
     "compiled": ({"batch": 100_000, "steps": 100}, {"batch": 5_000, "steps": 50}),

@@ -26,7 +26,6 @@ from benchmarks.plants import case
 from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.observer.step import advance, blank
 from gsisio_jax.scalar import scalar_program
-from gsisio_jax.scalar.options import cpu_options
 
 TILE = 2000
 THREADS = 2
@@ -133,7 +132,7 @@ class _Program:
 def _compiled(kind: str, function: Callable[..., Any], lower: Any, upper: Any, y: Any, widths: Any) -> _Program:
     size = min(TILE, len(lower))
     started = time.perf_counter()
-    program = jax.jit(function).lower(lower[:size], upper[:size], y).compile(compiler_options=cpu_options())
+    program = jax.jit(function).lower(lower[:size], upper[:size], y).compile()
     seconds = time.perf_counter() - started
 
     def tile(boxes: slice) -> Any:

@@ -17,7 +17,6 @@ from gsisio_jax import scalar
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.fixed import Fixed
-from gsisio_jax.scalar.options import cpu_options
 from gsisio_jax.study.axes import bare
 from gsisio_jax.study.reduction_base import Context, Kept, Reduction
 from gsisio_jax.study.row_source import Rows
@@ -57,10 +56,10 @@ def run_cases(
     return compiled()(observer, dict(varying), dict(shared), rows, reductions, hold)
 
 
-@cache  # not at import: asking for the backend starts JAX
+@cache
 def compiled() -> Any:
     """The jitted function behind `run_cases`."""
-    return jax.jit(_run, static_argnames=("fixed", "rows", "reductions", "hold"), compiler_options=cpu_options())
+    return jax.jit(_run, static_argnames=("fixed", "rows", "reductions", "hold"))
 
 
 def _run(
