@@ -154,6 +154,7 @@ def _check(
 ) -> tuple[Interval | None, Interval]:
     if form not in ("current", "prediction"):
         raise ValueError(f'design_observer: `form` must be "current" or "prediction", got {form!r}')
+    system.check_unchanged("design_observer")
     if gains < 1 or sweeps < 1:
         raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
     for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):

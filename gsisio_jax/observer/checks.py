@@ -52,6 +52,8 @@ def prepare(
     """Check shapes (and values of concrete arrays), and bring everything to one dtype, bounds rounded outward."""
     observer = rounded(call, observer, rounding)
     system = observer.system
+    if call != "step":  # which is called many times, and was checked by `start`
+        system.check_unchanged(call)
     lead = "(T, " if rows else "("
     if not (isinstance(y, jax.Array | np.ndarray) and jnp.issubdtype(y.dtype, jnp.floating)):
         y = np.asarray(y, dtype=np.float64) if not isinstance(y, jax.Array) else y.astype(float)

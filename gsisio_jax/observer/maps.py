@@ -29,7 +29,8 @@ class Plain:
 
     def __init__(self, system: Any):
         self.maps, self.n, self.m = system.maps, system.n, system.m
-        self._key = system.f, system.g, system.f_takes_u, system.g_takes_u, system.n, system.l, system.m
+        calls = system.f_takes_u, system.g_takes_u, system.captured
+        self._key = system.f, system.g, *calls, system.n, system.l, system.m
 
     def __hash__(self) -> int:
         return hash(self._key)

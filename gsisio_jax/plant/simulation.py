@@ -41,6 +41,7 @@ def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = N
 
     Source: paper, (eq:system); theory 11.
     """
+    system.check_unchanged("simulate")
     x0, d = jnp.asarray(x0, float), jnp.asarray(d, float)
     if d.ndim != 2 or d.shape[1] != system.p:
         raise ValueError(f"simulate: `d` must have shape (T, {system.p}), got {d.shape}")

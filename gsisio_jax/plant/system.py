@@ -6,24 +6,25 @@ y[k]   = g(x[k], u[k]) + D u[k] + H d[k] + v[k]
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.plant.calls import as_vector, check_map, takes_u
+from gsisio_jax.plant.captured import Captured, captured, changed
 
 
 class System(eqx.Module):
     """A plant with known maps and an unknown input; a pytree whose structure holds `f` and `g`.
 
     Args:
-        f: state map, a JAX function of ``x`` (n,) or of ``(x, u)``; returns (n,).
-        g: output map, a JAX function of ``x`` or of ``(x, u)``; returns (l,).
+        f: state map, a JAX function of ``x`` (n,) or of ``(x, u)``; returns (n,), or a list of n numbers. A second
+            argument without a default is the known input; with one (``u=...``) it is passed where m > 0.
+        g: output map, a JAX function of ``x`` or of ``(x, u)``; returns (l,), or a list of l numbers.
         G: how the unknown input enters the state, shape (n, p); p = 0 is a plain observer.
         H: how the unknown input enters the output (feedthrough), shape (l, p), any rank.
         B: how the known input enters the state, shape (n, m); zero if not given.
@@ -34,7 +35,8 @@ class System(eqx.Module):
 
     Raises:
         ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
-            the wrong shape, or a bound does not fit.
+            the wrong shape, it is unclear whether f or g takes u, known inputs have no effect, or a bound does not
+            fit.
 
     Source: paper, (eq:system); theory 1.
     """
@@ -49,6 +51,7 @@ class System(eqx.Module):
     D: Any
     state_bounds: Interval
     input_bounds: Interval
+    captured: tuple[Captured, Captured] = eqx.field(static=True)  # also tells apart one f before and after a change
 
     def __init__(
         self,
@@ -63,21 +66,23 @@ class System(eqx.Module):
         m: int | None = None,
     ):
         self.f, self.g = f, g
-        self.f_takes_u, self.g_takes_u = _takes_u(f, "f"), _takes_u(g, "g")
         self.G, self.H = _matrix("G", G), _matrix("H", H)
         if self.G.shape[1] != self.H.shape[1]:
             raise ValueError(
                 f"System: G has shape {self.G.shape} and H has shape {self.H.shape}; both need one column per "
                 "unknown input (give zero columns where an input does not act)"
             )
-        m = _known_inputs(B, D, m, self.f_takes_u or self.g_takes_u)
+        m = _known_inputs(B, D, m)
+        self.f_takes_u, self.g_takes_u = takes_u(f, "f", m), takes_u(g, "g", m)
+        m = _checked_inputs(m, self.f_takes_u or self.g_takes_u, B, D)
         self.B = np.zeros((self.n, m)) if B is None else _matrix("B", B, (self.n, m))
         self.D = np.zeros((self.l, m)) if D is None else _matrix("D", D, (self.l, m))
         _check_rank(self.G, self.H)
         self.state_bounds = _bounds("state_bounds", state_bounds, self.n)
         self.input_bounds = _bounds("input_bounds", input_bounds, self.p)
-        self._check_map("f", self.dynamics, self.n)
-        self._check_map("g", self.measurement, self.l)
+        self.captured = captured(f), captured(g)
+        check_map("f", self.dynamics, self.n, self.n, m)
+        check_map("g", self.measurement, self.l, self.n, m)
 
     @property
     def n(self) -> int:
@@ -106,30 +111,25 @@ class System(eqx.Module):
 
     def dynamics(self, x: Any, u: Any) -> Any:
         """``f(x)`` or ``f(x, u)``, whichever the user gave."""
-        return self.f(x, u) if self.f_takes_u else self.f(x)
+        return as_vector(self.f(x, u) if self.f_takes_u else self.f(x), self.n, x.dtype)
 
     def measurement(self, x: Any, u: Any) -> Any:
         """``g(x)`` or ``g(x, u)``, whichever the user gave."""
-        return self.g(x, u) if self.g_takes_u else self.g(x)
+        return as_vector(self.g(x, u) if self.g_takes_u else self.g(x), self.l, x.dtype)
+
+    def check_unchanged(self, call: str) -> None:
+        """Refuse to go on where numbers that f or g reads from around it have changed since the system was made."""
+        for name, function, before in (("f", self.f, self.captured[0]), ("g", self.g, self.captured[1])):
+            if names := changed(function, before):
+                raise ValueError(
+                    f"{call}: {name} reads {', '.join(f'`{n}`' for n in names)}, which has changed since the System "
+                    "was made: its gains and compiled programs hold the old value. Make a new System (and design "
+                    "again), or give every system its own values, with functools.partial or a function that returns f"
+                )
 
     def maps(self, x: Any, u: Any) -> Any:
         """f and g together, (n + l,)."""
         return jnp.concatenate([self.dynamics(x, u), self.measurement(x, u)])
-
-    def _check_map(self, name: str, function: Callable[..., Any], size: int) -> None:
-        dtype = jnp.result_type(float)
-        x, u = jax.ShapeDtypeStruct((self.n,), dtype), jax.ShapeDtypeStruct((self.m,), dtype)
-        try:
-            out = jax.eval_shape(function, x, u)
-        except Exception as error:
-            raise ValueError(
-                f"System: calling {name} with x of shape ({self.n},) and u of shape ({self.m},) failed: {error}"
-            ) from error
-        if getattr(out, "shape", None) != (size,):
-            raise ValueError(
-                f"System: {name} must return an array of shape ({size},) to fit the rows of "
-                f"{'G' if name == 'f' else 'H'}, it returns {getattr(out, 'shape', type(out).__name__)}"
-            )
 
 
 class Noise(eqx.Module):
@@ -173,24 +173,6 @@ class Noise(eqx.Module):
         return Noise.unchecked(self.w.astype(dtype), self.v.astype(dtype))
 
 
-def _takes_u(function: Callable[..., Any], name: str) -> bool:
-    """Does the user's map take (x, u)? Counted from its required positional parameters."""
-    if not callable(function):
-        raise ValueError(f"System: `{name}` must be a function of x or of (x, u), got {type(function).__name__}")
-    try:
-        parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # builtins without a signature
-        return False
-    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    required = [p for p in parameters if p.kind in positional and p.default is inspect.Parameter.empty]
-    if len(required) not in (1, 2):
-        raise ValueError(
-            f"System: `{name}` must take x or (x, u); it takes {len(required)} required arguments "
-            f"({', '.join(p.name for p in required)}); bind parameters with functools.partial"
-        )
-    return len(required) == 2
-
-
 def _matrix(name: str, value: Any, shape: tuple[int, int] | None = None) -> np.ndarray:
     try:
         matrix = np.asarray(value, dtype=np.float64)
@@ -205,17 +187,29 @@ def _matrix(name: str, value: Any, shape: tuple[int, int] | None = None) -> np.n
     return matrix
 
 
-def _known_inputs(B: Any, D: Any, m: int | None, takes_u: bool) -> int:
+def _known_inputs(B: Any, D: Any, m: int | None) -> int | None:
+    """What B, D and m say of the number of known inputs; None where they say nothing."""
     sizes = {np.shape(matrix)[1] for matrix in (B, D) if matrix is not None and np.ndim(matrix) == 2}
     if m is not None:
+        if isinstance(m, bool) or int(m) != m or m < 0:
+            raise ValueError(f"System: `m` must be the number of known inputs, got {m!r}")
         sizes.add(int(m))
     if len(sizes) > 1:
         raise ValueError(f"System: B, D and m disagree on the number of known inputs: {sorted(sizes)}")
-    if not sizes and takes_u:
+    return sizes.pop() if sizes else None
+
+
+def _checked_inputs(m: int | None, used: bool, B: Any, D: Any) -> int:
+    if m is None and used:
         raise ValueError(
             "System: f or g takes u, but B and D are not given; say how many known inputs there are: m=..."
         )
-    return sizes.pop() if sizes else 0
+    if m and not used and all(matrix is None or not np.any(matrix) for matrix in (B, D)):
+        raise ValueError(
+            f"System: there are {m} known inputs, but neither f, g, B nor D takes u, so they would have no effect. "
+            "Give f or g a second argument u, or a matrix B or D that is not zero; or leave out m"
+        )
+    return m or 0
 
 
 def _check_rank(G: np.ndarray, H: np.ndarray) -> None:

@@ -274,6 +274,7 @@ def prepare(call: str, system: System, arguments: Mapping[str, Any]) -> tuple[di
     Raises:
         ValueError: a shape or a number is not legal.
     """
+    system.check_unchanged(call)
     initial, y, noise = (bare(arguments[name]) for name in ("initial", "y", "noise"))
     if not isinstance(initial, Interval) or not isinstance(noise, Noise):
         name, kind = ("noise", "Noise") if isinstance(initial, Interval) else ("initial", "Interval")

@@ -117,6 +117,7 @@ def _check(observer: Any, records: Any, objective: str, method: str, tolerance: 
         )
     if not isinstance(records, Records):
         raise ValueError(f"tune_noise: `records` must be gsisio_jax.tuning.Records, got {type(records).__name__}")
+    observer.system.check_unchanged("tune_noise")
     if objective not in ("bounds", "widths"):
         raise ValueError(f'tune_noise: `objective` must be "bounds" or "widths", got {objective!r}')
     if method not in ("auto", "lp", "optax"):

@@ -135,7 +135,7 @@ def test_grids_of_grids_and_coordinates_of_two_dimensions_are_refused():
 
 
 PLANT = gx.System(lambda x: x, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)))
-PUMPED = gx.System(lambda x: x, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)), m=1)
+PUMPED = gx.System(lambda x, u: x + u, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)), m=1)
 FINE = {"initial": boxes(1)[0], "y": records(3), "noise": SHARED, "u": None, "length": None, "truth": None}
 NAN, INF = np.full((T, 2), np.nan), np.full((T, 2), np.inf)
 

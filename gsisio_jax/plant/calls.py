@@ -1,0 +1,130 @@
+"""How the user's maps are called, and what they may return. Nothing is guessed: what is unclear is refused."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+_POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+_NONE = inspect.Parameter.empty
+
+
+def takes_u(function: Callable[..., Any], name: str, m: int | None) -> bool:
+    """Is the map called as ``function(x, u)``, or as ``function(x)``? Decided by its signature and by m alone.
+
+    A second parameter without a default is the known input. One with a default is passed where there are known inputs
+    (m > 0) if it is called ``u``; another name could be a parameter of the model, so it is refused then.
+
+    Args:
+        function: f or g.
+        name: "f" or "g".
+        m: number of known inputs; None where it is not known yet.
+
+    Raises:
+        ValueError: it is no function, or cannot be called with x or (x, u), or it is unclear which.
+    """
+    if not callable(function):
+        raise ValueError(f"System: `{name}` must be a function of x or of (x, u), got {type(function).__name__}")
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):  # builtins without a signature
+        return False
+    _check_keywords(function, name, parameters)
+    places = [p for p in parameters if p.kind in _POSITIONAL]
+    required = [p for p in places if p.default is _NONE]
+    many = any(p.kind is inspect.Parameter.VAR_POSITIONAL for p in parameters)
+    if len(required) > 2 or not (places or many):
+        raise ValueError(
+            f"System: `{name}` must take x or (x, u); it takes {len(required)} required arguments "
+            f"({', '.join(p.name for p in required)}); bind parameters with functools.partial"
+        )
+    if len(required) == 2:
+        return True
+    if not m:
+        return False
+    optional = places[1:2]
+    if optional and optional[0].name != "u":
+        raise ValueError(
+            f"System: there are {m} known inputs, and it is unclear whether the optional argument "
+            f"`{optional[0].name}` of `{name}` is meant for them. Call it `u` if it is; if not, bind it with "
+            f"functools.partial({name}, {optional[0].name}=...)"
+        )
+    return bool(optional) or many
+
+
+def _check_keywords(function: Callable[..., Any], name: str, parameters: list[inspect.Parameter]) -> None:
+    """Keyword-only arguments are never passed: they must have been bound, or not be the known input."""
+    bound = function.keywords if isinstance(function, functools.partial) else {}
+    for p in parameters:
+        if p.kind is not inspect.Parameter.KEYWORD_ONLY or p.name in bound:
+            continue
+        if p.default is _NONE or p.name == "u":
+            raise ValueError(
+                f"System: `{name}` has the keyword-only argument `{p.name}`, which would not be passed. Make the known "
+                "input the second positional argument, and bind parameters with functools.partial"
+            )
+
+
+def as_vector(out: Any, size: int, dtype: Any) -> Any:
+    """What a map returned, as an array of shape (size,) of the type of x: lists of numbers are stacked, and a single
+    number serves where one is asked for. What has another shape is handed back, for the caller to say so."""
+    if isinstance(out, list | tuple) and len(out) == size and all(jnp.ndim(v) == 0 for v in out):
+        out = jnp.stack([jnp.asarray(v) for v in out]) if size else jnp.zeros(0, dtype)
+    if not hasattr(out, "shape") and isinstance(out, int | float | complex):
+        out = jnp.asarray(out)
+    if getattr(out, "shape", None) == () and size == 1:
+        out = jnp.reshape(out, (1,))
+    if not hasattr(out, "dtype") or jnp.issubdtype(out.dtype, jnp.inexact):
+        return out
+    return jnp.asarray(out).astype(dtype)
+
+
+def check_map(name: str, function: Callable[..., Any], size: int, n: int, m: int) -> None:
+    """Call a map once with abstract values, and refuse what it returns where that is not (size,) real numbers.
+
+    Raises:
+        ValueError: it fails, or returns something else.
+    """
+    dtype = jnp.result_type(float)
+    x, u = jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype)
+    found: list[Any] = []
+
+    def once(x: Any, u: Any) -> None:
+        found.append(function(x, u))
+
+    try:
+        jax.eval_shape(once, x, u)
+    except Exception as error:
+        raise ValueError(
+            f"System: calling {name} with x of shape ({n},) and u of shape ({m},) failed: {_first_line(error)}"
+            f"{_remedy(error)}"
+        ) from error
+    out = found[0]
+    if getattr(out, "shape", None) != (size,):
+        got = "nothing (None)" if out is None else getattr(out, "shape", None) or type(out).__name__
+        raise ValueError(
+            f"System: {name} must return an array of shape ({size},) to fit the rows of "
+            f"{'G' if name == 'f' else 'H'}, it returns {() if getattr(out, 'shape', None) == () else got}"
+        )
+    if not jnp.issubdtype(out.dtype, jnp.floating):
+        raise ValueError(
+            f"System: {name} must return real numbers, it returns {out.dtype}; write complex states as their real and "
+            "imaginary parts"
+        )
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().split("\n")[0] or type(error).__name__
+
+
+def _remedy(error: Exception) -> str:
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        return ". Use jax.numpy in the place of numpy (jnp.sin, not np.sin): JAX has to follow what is computed"
+    if isinstance(error, jax.errors.TracerBoolConversionError | jax.errors.ConcretizationTypeError):
+        return ". Python's `if`, `and` and float() cannot depend on x; use jnp.where, jnp.logical_and, jax.lax.cond"
+    return ""
