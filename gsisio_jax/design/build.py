@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal, overload
 
 import numpy as np
 
 from gsisio_jax.design.assemble import Plan, assemble
-from gsisio_jax.design.existence import check_existence, check_rank
+from gsisio_jax.design.existence import check_existence
 from gsisio_jax.design.feedthrough import factorise
-from gsisio_jax.design.gain_selection import distinct, gains_for_missing, main_gain, profile_bank, typical_width, units
+from gsisio_jax.design.first_gain import first_gain
+from gsisio_jax.design.gain_selection import distinct, gains_for_missing, profile_bank, typical_width, units
 from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.inputs import input_bounds
@@ -39,6 +40,7 @@ def design_observer(
     missing: bool = True,
     sweeps: int = 3,
     bounds: Sequence[str] | None = None,
+    certify: bool = True,
 ) -> Observer: ...
 
 
@@ -70,6 +72,7 @@ def design_observer(
     left_inverse: LeftInverse | Any = "pseudo",
     allow_uncertified: bool = False,
     derivative: Interval | None = None,
+    certify: bool = True,
 ) -> Observer | PredictionObserver:
     """Design the gains of an interval observer offline, and certify the width of its boxes.
 
@@ -94,6 +97,9 @@ def design_observer(
         allow_uncertified: prediction form: run it even where it is no framer; crossed steps carry the status CROSSED.
         derivative: prediction form: box (n + l, n) that contains the derivative of [f; g] everywhere, for
             "decomposition" and "remainder" as the paper uses them; None encloses it on every box, which is tighter.
+        certify: current form: refuse where no width can be promised. False gives an observer without a certificate
+            wherever boxes can be computed: they are certain all the same, but may be wide or infinite. Where f or g
+            jump there is never a certificate, and this makes no difference.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
@@ -102,7 +108,8 @@ def design_observer(
     Raises:
         ObserverDoesNotExist: an input direction is proved invisible.
         FramerNotGuaranteed: the prediction form is no framer for this system.
-        NoDesignFound: no gain with finite boxes was found; says what failed and what may help.
+        NoDesignFound: no gain with finite boxes was found; says what failed, in which line of f or g where it is one,
+            and what may help.
         ValueError: shapes do not agree, or an argument is out of range.
 
     Source: theory 3, 4 and 6; paper, Theorem 1.
@@ -117,16 +124,9 @@ def design_observer(
     everywhere = slopes_on(system.state_bounds)
     check_existence(system, feedthrough, everywhere)
     plan = Plan(system, noise, feedthrough, u_region)
-    box = find_region(system, lambda box: _steady_width(plan, box, slopes_on(box))) if given is None else given
-    slopes = slopes_on(box)
-    if not slopes.finite:
-        raise NoDesignFound(
-            f"design_observer: the derivatives of f or g are not bounded on the region {box}. Give a smaller region "
-            "that keeps away from points where they are infinite (a square root at 0, say)."
-        )
-    problem = plan.problem(slopes)
-    check_rank(problem)
-    main = main_gain(problem, box)
+    box = _found_region(plan, slopes_on, certify) if given is None else given
+    first = first_gain(plan, slopes_on, box, certify)
+    problem, main = first.problem, first.gain
     bank = [main, *profile_bank(problem, main, box, gains - 1)]
     if missing:
         bank.extend(gains_for_missing(problem, main, box, feedthrough))
@@ -135,8 +135,11 @@ def design_observer(
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
     outputs, slack = first_form(system, feedthrough.T2, u_region)
     observer = assemble(plan, problem, box, bank, input_bounds(problem, width), everywhere.affine, methods, sweeps)
-    observer = with_rounding_constants(observer, system, slopes, everywhere, outputs, slack, np.float64)
-    check_initial_contraction(problem, bank[0], observer, outputs)
+    if first.uncertified:
+        observer = replace(observer, certificate=observer.certificate.without_promise(first.uncertified))
+    observer = with_rounding_constants(observer, system, first.slopes, everywhere, outputs, slack, np.float64)
+    if certify:
+        check_initial_contraction(problem, bank[0], observer, outputs)
     if not missing:
         return observer
     certificate = replace(observer.certificate, recoverable=recovers(observer, width, u_region))
@@ -175,6 +178,17 @@ def _check(
     if u_region.shape != (system.m,):
         raise ValueError(f"design_observer: `u_region` must have shape ({system.m},), got {u_region.shape}")
     return (region if isinstance(region, Interval) else None), u_region
+
+
+def _found_region(plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool) -> Interval:
+    """region="auto"; where there is none and no certificate is asked for, the point that the search began at."""
+    try:
+        return find_region(plan.system, lambda box: _steady_width(plan, box, slopes_on(box)))
+    except NoDesignFound:
+        if certify:
+            raise
+        center = np.asarray(plan.system.state_bounds.center, np.float64)
+        return Interval(center, center)
 
 
 def _steady_width(plan: Plan, region: Interval, slopes: Slopes) -> np.ndarray:

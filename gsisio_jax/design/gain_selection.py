@@ -39,13 +39,18 @@ def main_gain(problem: GainProblem, region: Interval) -> np.ndarray:
             "design_observer: the linear program for the gain has no solution although the rank condition holds; the "
             "problem is badly scaled. Choose units in which states, outputs and noise have similar size."
         )
-    if spectral_radius(problem.implicit(gain)) >= 1 - 1e-9:
+    if spectral_radius(problem.implicit(gain)) < 1 - 1e-9:
+        return gain
+    # Without T2 g(x[k]) there is no such term; where no input has to be cancelled that is a gain, too.
+    everything[problem.l : problem.l + problem.q] = False
+    plain = profile_gain(problem, scale, everything, units(scale))
+    if plain is None:
         raise NoDesignFound(
             "design_observer: on this region the output is too nonlinear for the gain: rho(|N_z| R) = "
-            f"{spectral_radius(problem.implicit(gain)):.3g} >= 1, so the box of x[k] would not be finite. What may "
-            "help: a smaller region, or `state_bounds`."
+            f"{spectral_radius(problem.implicit(gain)):.3g} >= 1, so the box of x[k] would not be finite. "
+            f"{problem.how_inputs_show()} What may help: a smaller region, `state_bounds`, or more outputs."
         )
-    return gain
+    return plain
 
 
 def profile_bank(problem: GainProblem, main: np.ndarray, region: Interval, count: int) -> list[np.ndarray]:

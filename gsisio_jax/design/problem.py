@@ -74,6 +74,16 @@ class GainProblem:
         """``[H; C G]``: what of the input reaches y[k-1] and z[k], shape (columns, p)."""
         return np.vstack([self.H, self.C @ self.G])
 
+    def how_inputs_show(self) -> str:
+        """How strongly the free inputs show in the outputs, against how much slopes vary: for messages."""
+        shown = np.linalg.svd(self.seen[:, self.free], compute_uv=False)
+        varies = np.abs(self.R) @ np.abs(self.G[:, self.free])
+        values = ", ".join(f"{value:.3g}" for value in shown)
+        return (
+            f"The unknown input shows in [H; C G] with the singular values {values}, while over the region the slopes "
+            f"of the outputs along it vary by up to +-{varies.max(initial=0.0):.3g}."
+        )
+
     def split(self, N: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """A gain as (N_y, its part on T2 y, its part on the state bounds)."""
         return N[:, : self.l], N[:, self.l : self.l + self.q], N[:, self.l + self.q :]

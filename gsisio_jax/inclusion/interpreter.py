@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +44,11 @@ from gsisio_jax.scalar.unroll import numbers_in
 # Longer loops, and loops over more operations, are kept as loops: compile time grows with every unrolled turn.
 _UNROLL = 16
 _UNROLLED_NUMBERS = 120
+# Told of every operation that is bounded: its name, the lines of the user's code that led to it, operands and results.
+WATCH: ContextVar[Callable[[str, Sequence[str], Sequence[Any], Sequence[Any]], None] | None] = ContextVar(
+    "gsisio_jax_watch", default=None
+)
+_PLACES: ContextVar[tuple[str, ...]] = ContextVar("gsisio_jax_places", default=())
 _OURS, _JAX = os.path.dirname(__file__), os.path.dirname(jax.__file__)
 
 
@@ -58,13 +64,29 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
 
     for eqn in jaxpr.eqns:
         try:
-            out = _result(eqn, [read(atom) for atom in eqn.invars])
+            out = _watched(eqn, [read(atom) for atom in eqn.invars])
         except UnknownPrimitiveError as error:
             if error.place is not None or (place := _caller(eqn)) is None:
                 raise
             raise UnknownPrimitiveError(error.operation, error.detail, place) from None
         values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out], strict=True))
     return [read(atom) for atom in jaxpr.outvars]
+
+
+def _watched(eqn: Any, args: Sequence[Any]) -> Any:
+    """`_result`, reported where somebody watches."""
+    watch = WATCH.get()
+    if watch is None:
+        return _result(eqn, args)
+    place = _caller(eqn)
+    token = _PLACES.set(_PLACES.get() if place is None else (*_PLACES.get(), place))
+    try:
+        out = _result(eqn, args)
+        name = eqn.params.get("name") or eqn.primitive.name
+        watch(name, _PLACES.get(), args, out if eqn.primitive.multiple_results else [out])
+        return out
+    finally:
+        _PLACES.reset(token)
 
 
 def _result(eqn: Any, args: Sequence[Any]) -> Any:

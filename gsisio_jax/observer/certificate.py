@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -80,6 +81,13 @@ class Certificate(eqx.Module):
     def self_consistent(self) -> bool:
         """The certificate is not empty: boxes of the steady width fit into the region."""
         return self.certified and (not self.region_matters or bool((self.slack >= 0).all()))
+
+    def without_promise(self, why: str) -> Certificate:
+        """No width is promised, for that reason, which becomes a note."""
+        infinite = {name: np.full(np.shape(getattr(self, name)), np.inf) for name in (
+            "growth", "implicit", "input_state_before", "steady_width", "input_width",
+        )}  # fmt: skip
+        return replace(self, **infinite, promised=False, notes=(*self.notes, why))
 
     def noise_width(self, noise: Noise) -> Any:
         """What one step adds to the width, b of theory 4.1, (n,) or (T, n)."""

@@ -79,9 +79,9 @@ def as_vector(out: Any, size: int, dtype: Any) -> Any:
         out = jnp.asarray(out)
     if getattr(out, "shape", None) == () and size == 1:
         out = jnp.reshape(out, (1,))
-    if not hasattr(out, "dtype") or jnp.issubdtype(out.dtype, jnp.inexact):
-        return out
-    return jnp.asarray(out).astype(dtype)
+    kind = getattr(out, "dtype", None)
+    real = kind is None or jnp.issubdtype(kind, jnp.inexact)
+    return out if real else jax.lax.convert_element_type(out, dtype)
 
 
 def check_map(name: str, function: Callable[..., Any], size: int, n: int, m: int) -> None:

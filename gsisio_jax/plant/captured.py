@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 Captured = tuple[tuple[str, str], ...]
 _DEEPEST = 4  # functions that call functions, containers in containers
@@ -97,7 +98,7 @@ def _attributes(value: Any) -> dict[str, Any]:
 def _members(names: dict[Any, Any], seen: set[int], depth: int) -> Iterator[tuple[str, Any]]:
     for name, value in names.items():
         if isinstance(value, np.ndarray | np.generic | float | int | complex | jax.Array):
-            if not isinstance(value, jax.core.Tracer) and not np.issubdtype(np.result_type(value), np.object_):
+            if not isinstance(value, Tracer) and not np.issubdtype(np.result_type(value), np.object_):
                 yield str(name), value
         elif depth <= 0:
             continue

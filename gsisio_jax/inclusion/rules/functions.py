@@ -136,7 +136,7 @@ def power(p: float) -> Any:
         return largest ** (1 / p) if p > 1 else INF
 
     def slope_reach(largest: float) -> float:
-        return (largest / p) ** (1 / q) if q > 0 else INF
+        return (largest / p) ** (1 / q) if q >= 1 else INF  # slower than t it does not overflow
 
     if p == int(p):
         p, q = int(p), int(p) - 1
