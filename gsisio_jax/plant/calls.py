@@ -73,15 +73,16 @@ def _check_keywords(function: Callable[..., Any], name: str, parameters: list[in
 def as_vector(out: Any, size: int, dtype: Any) -> Any:
     """What a map returned, as an array of shape (size,) of the type of x: lists of numbers are stacked, and a single
     number serves where one is asked for. What has another shape is handed back, for the caller to say so."""
+    value: Any = out
     if isinstance(out, list | tuple) and len(out) == size and all(jnp.ndim(v) == 0 for v in out):
-        out = jnp.stack([jnp.asarray(v) for v in out]) if size else jnp.zeros(0, dtype)
-    if not hasattr(out, "shape") and isinstance(out, int | float | complex):
-        out = jnp.asarray(out)
-    if getattr(out, "shape", None) == () and size == 1:
-        out = jnp.reshape(out, (1,))
-    kind = getattr(out, "dtype", None)
+        value = jnp.stack([jnp.asarray(v) for v in out]) if size else jnp.zeros(0, dtype)
+    elif isinstance(out, int | float | complex):
+        value = jnp.asarray(out)
+    if getattr(value, "shape", None) == () and size == 1:
+        value = jnp.reshape(value, (1,))
+    kind = getattr(value, "dtype", None)
     real = kind is None or jnp.issubdtype(kind, jnp.inexact)
-    return out if real else jax.lax.convert_element_type(out, dtype)
+    return value if real else jax.lax.convert_element_type(value, dtype)
 
 
 def check_map(name: str, function: Callable[..., Any], size: int, n: int, m: int) -> None:
