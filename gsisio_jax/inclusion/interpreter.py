@@ -35,7 +35,9 @@ from gsisio_jax.inclusion.node import (
     settled,
     slope_of,
 )
+from gsisio_jax.inclusion.origin import remember
 from gsisio_jax.inclusion.rules import comparison, linear
+from gsisio_jax.inclusion.rules.piecewise import by_pieces
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
@@ -64,12 +66,15 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
 
     for eqn in jaxpr.eqns:
         try:
-            out = _watched(eqn, [read(atom) for atom in eqn.invars])
+            operands = [read(atom) for atom in eqn.invars]
+            out = _watched(eqn, operands)
         except UnknownPrimitiveError as error:
             if error.place is not None or (place := _caller(eqn)) is None:
                 raise
             raise UnknownPrimitiveError(error.operation, error.detail, place) from None
-        values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out], strict=True))
+        results = out if eqn.primitive.multiple_results else [out]
+        remember(eqn, operands, results)
+        values.update(zip(eqn.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -104,6 +109,8 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
     if name in REDUCTIONS or name in ELEMENTWISE:
         aligned = args if name in REDUCTIONS else _aligned(args, eqn.outvars[0].aval.shape)
         value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
+        if name in ("select_n", "mul") and is_node(value):
+            value = by_pieces(eqn, args, value, _result, ELEMENTWISE)
         return settle(value) if is_node(value) and not value.unnormalised else value
     raise UnknownPrimitiveError(name)
 

@@ -1,0 +1,145 @@
+"""Where a node comes from: its operation and operands, so that a part of a function can be evaluated once more.
+
+A rule sees ranges, and ranges forget: that both cases of a `where` are functions of the number that it compares, that
+a numerator is the sine of the denominator. What was remembered here lets rules ask for it. Origins live as long as a
+function is being traced; nodes that come out of loops, or straight from an argument, have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gsisio_jax.inclusion.form_arithmetic import is_known
+from gsisio_jax.inclusion.node import Node, is_node
+from gsisio_jax.interval.box import is_concrete
+
+MOST_OPERATIONS = 200  # that one evaluation once more may cost
+
+
+class Origin(NamedTuple):
+    """The equation of a node, its operands (nodes and constants), and which of its results the node is."""
+
+    equation: Any
+    operands: Sequence[Any]
+    index: int
+
+    @property
+    def name(self) -> str:
+        return self.equation.primitive.name
+
+
+class NotAgain(Exception):
+    """It would take more than `MOST_OPERATIONS`, or mix entries where that is not allowed."""
+
+
+def remember(equation: Any, operands: Sequence[Any], results: Sequence[Any]) -> None:
+    """Note where nodes come from that have no origin yet."""
+    for index, result in enumerate(results):
+        if is_node(result) and origin(result) is None and all(result is not v for v in operands):
+            object.__setattr__(result, "origin", Origin(equation, tuple(operands), index))
+
+
+def origin(value: Any) -> Origin | None:
+    return getattr(value, "origin", None)
+
+
+def made_by(value: Any, *names: str) -> Sequence[Any] | None:
+    """The operands of a node, if one of these primitives made it."""
+    found = origin(value)
+    return found.operands if found is not None and found.name in names else None
+
+
+def same(a: Any, b: Any, memo: dict[tuple[int, int], bool] | None = None) -> bool:
+    """Are these certainly the same number: one node, equal constants, or one operation on the same operands?"""
+    if a is b:
+        return True
+    if is_known(a) and is_known(b):
+        return a.dtype == b.dtype and a.shape == b.shape and bool(np.array_equal(a, b))
+    first, second = origin(a), origin(b)
+    if first is None or second is None or first.name != second.name or first.index != second.index:
+        return False
+    memo = {} if memo is None else memo
+    pair = id(a), id(b)
+    if pair not in memo:
+        memo[pair] = (
+            len(first.operands) == len(second.operands)
+            and _equal(first.equation.params, second.equation.params)
+            and all(same(v, w, memo) for v, w in zip(first.operands, second.operands, strict=True))
+        )
+    return memo[pair]
+
+
+def _equal(a: Any, b: Any) -> bool:
+    """Parameters of two equations; what cannot be compared is not equal."""
+    try:
+        return a is b or bool(a == b)
+    except Exception:
+        return False
+
+
+class Again:
+    """Evaluates nodes once more with some of them replaced.
+
+    Args:
+        apply: evaluates an equation for given operands (the interpreter).
+        allowed: names of the primitives that may take what is replaced; None for all.
+        replaced: pairs of a node and what takes its place, a node or a constant.
+
+    Raises:
+        NotAgain: when called, where that would take too many operations, or one that is not allowed.
+    """
+
+    def __init__(
+        self,
+        apply: Callable[[Any, Sequence[Any]], Any],
+        allowed: Container[str] | None,
+        replaced: Sequence[tuple[Node, Any]],
+    ):
+        self.apply, self.allowed, self.replaced = apply, allowed, replaced
+        self._memo: dict[int, Any] = {}
+        self._same: dict[tuple[int, int], bool] = {}
+        self._operations = 0
+
+    def __call__(self, value: Any) -> Any:
+        if not is_node(value):
+            return value
+        if id(value) not in self._memo:
+            self._memo[id(value)] = self._evaluate(value)
+        return self._memo[id(value)]
+
+    def equation(self, equation: Any, operands: Sequence[Any]) -> Any:
+        """The first result of an equation, for operands evaluated once more."""
+        return self._applied(Origin(equation, operands, 0))
+
+    def _evaluate(self, node: Node) -> Any:
+        for old, new in self.replaced:
+            if same(node, old, self._same):
+                return new
+        found = origin(node)
+        return node if found is None else self._applied(found, node)
+
+    def _applied(self, found: Origin, before: Node | None = None) -> Any:
+        operands = [self(v) for v in found.operands]
+        if before is not None and all(new is old for new, old in zip(operands, found.operands, strict=True)):
+            return before
+        if found.name == "select_n" and (chosen := decided(operands[0])) is not None:
+            return operands[1 + chosen]
+        self._operations += 1
+        if self._operations > MOST_OPERATIONS or not (self.allowed is None or found.name in self.allowed):
+            raise NotAgain
+        out = self.apply(found.equation, operands)
+        results = out if found.equation.primitive.multiple_results else [out]
+        remember(found.equation, operands, results)
+        return results[found.index]
+
+
+def decided(which: Any) -> int | None:
+    """The case that a selection takes everywhere, where that is known while tracing."""
+    sides = (which.range.lower, which.range.upper) if is_node(which) else (which,)
+    if not all(is_concrete(side) for side in sides):
+        return None
+    cases = np.unique(np.stack([np.asarray(side) for side in sides]))
+    return int(cases[0]) if cases.size == 1 else None

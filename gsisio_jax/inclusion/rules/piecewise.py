@@ -1,0 +1,252 @@
+"""Functions in pieces: a choice, or a product with a switch, bounded piece by piece, and as continuous where it is.
+
+Where a function switches between cases at cuts of one number p (the pivot, see `switches`), every case matters only
+for p on its own side. So each is evaluated once more with the range of p cut down to the segment (`origin.Again`), and
+the hull is taken of what is possible: that is the range, and with one common slope the form.
+
+**Continuity.** At a cut c both neighbours are evaluated with p = c. Let j bound the difference of the two. Where j is 0
+the function is continuous along p there, and its difference quotients lie in the hull of those of its pieces: on the
+way from a to b within the box p passes through c, where both pieces agree. Where j is not 0 but as small as rounding,
+``f = continuous part + r`` with ``|r| <= j`` (the jumps at all cuts): the hull bounds the continuous part, and the
+range is widened by 2 j. A value of f at a point then covers the continuous part as well as f at any other point of
+the box, up to the hull times the distance: that is all that mean-value forms use. Everywhere else derivatives are
+infinite where a cut lies inside the range of p.
+
+**Arrays.** Every entry of p is on a segment of its own, so where p has more than one entry nothing between it and the
+result may mix entries.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Sequence
+from contextlib import nullcontext
+from contextvars import ContextVar
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from gsisio_jax.inclusion.form_arithmetic import shift, slope_image
+from gsisio_jax.inclusion.node import (
+    Form,
+    Node,
+    as_node,
+    best_form,
+    is_node,
+    jac_of,
+    parts,
+    settled,
+    slack_of,
+    slope_of,
+)
+from gsisio_jax.inclusion.origin import Again, NotAgain, origin
+from gsisio_jax.inclusion.rules.linear import move, subtract
+from gsisio_jax.inclusion.rules.switches import Switch, switch_in, switch_of
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, choose, entire_like
+from gsisio_jax.interval.minmax import larger, smaller
+from gsisio_jax.interval.primitives import times
+
+_CONTINUOUS = 1e-9  # jumps up to this share of the value count as rounding of the model's own numbers
+_DEPTH: ContextVar[int] = ContextVar("gsisio_jax_piecewise_depth", default=0)
+_DEEPEST = 2  # pieces within pieces that are evaluated once more
+
+Apply = Callable[[Any, Sequence[Any]], Any]
+
+
+def by_pieces(eqn: Any, args: Sequence[Any], plain: Node, apply: Apply, elementwise: Container[str]) -> Node:
+    """The result of a choice or product, given what its plain rule says of it; that one where nothing is gained.
+
+    Args:
+        eqn: of ``select_n`` or ``mul``.
+        args: its operands.
+        plain: the node that the rule made of them.
+        apply: evaluates an equation for other operands.
+        elementwise: names of the primitives that do not mix entries.
+    """
+    if _DEPTH.get() >= _DEEPEST or not jnp.issubdtype(plain.dtype, jnp.floating):
+        return plain
+    if eqn.primitive.name == "select_n":
+        switch = switch_of(args[0])
+    else:
+        switch = next((found for v in args if (found := switch_in(v)) is not None), None)
+    if switch is None or switch.pivot.shape not in (plain.shape, ()) or not _fits(switch):
+        return plain
+    token = _DEPTH.set(_DEPTH.get() + 1)
+    try:
+        single = switch.pivot.range.lower.size == 1
+        again = partial(Again, apply, None if single else elementwise)
+        jumps = [_jump(eqn, args, again, switch, i) for i in range(len(switch.cuts))]
+        cases = [_on_segment(eqn, args, again, switch, i, plain) for i in range(len(switch.between))]
+    except NotAgain:
+        return plain
+    finally:
+        _DEPTH.reset(token)
+    return _hull(plain, switch, cases, jumps)
+
+
+def _fits(switch: Switch) -> bool:
+    return jnp.issubdtype(switch.pivot.dtype, jnp.floating) and all(np.isfinite(c).all() for c in switch.cuts)
+
+
+def _value(switch: Switch, value: Any) -> np.ndarray:
+    return np.full(switch.node.shape, value, switch.node.dtype)
+
+
+def _jump(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int) -> tuple[Any, Any]:
+    """Bound of the differences between the values at cut i and just below and above it, and of the size of these."""
+    pivot = switch.pivot
+    cut = np.broadcast_to(switch.cuts[i], pivot.shape).astype(pivot.dtype)
+    thin = Node(Interval.unchecked(cut, cut))
+    known = _only_constants(args, pivot)
+    with jax.ensure_compile_time_eval() if known else nullcontext():
+        values = []
+        for value in (switch.at[i], switch.between[i], switch.between[i + 1]):
+            found = again([(pivot, thin), (switch.node, _value(switch, value))]).equation(eqn, args)
+            dtype = eqn.outvars[0].aval.dtype
+            values.append(settled(found) if is_node(found) else as_node(found, eqn.outvars[0].aval.shape, dtype))
+        gaps = [settled(subtract(values[0], other)).range for other in values[1:]]
+        jump = jnp.maximum(*(jnp.maximum(abs(gap.lower), abs(gap.upper)) for gap in gaps))
+        size = jnp.maximum(abs(values[0].range.lower), abs(values[0].range.upper))
+        jump = jnp.where(jnp.isnan(jump), jnp.inf, jump)
+        return (np.asarray(jump), np.asarray(size)) if known else (jump, size)
+
+
+def _only_constants(args: Sequence[Any], pivot: Node) -> bool:
+    """Do the operands depend on nothing but the pivot and constants?"""
+    stack, seen = list(args), set()
+    while stack:
+        value = stack.pop()
+        if id(value) in seen or value is pivot:
+            continue
+        seen.add(id(value))
+        if not is_node(value):
+            if isinstance(value, Tracer):
+                return False
+        elif (found := origin(value)) is not None:
+            stack += found.operands
+        else:
+            return False
+    return True
+
+
+class _Case(NamedTuple):
+    """One segment: can p lie on it (a mask), the range of p there, and the result if it does."""
+
+    possible: Any
+    pivot: Interval
+    node: Node
+
+
+def _on_segment(
+    eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int, plain: Node
+) -> _Case:
+    pivot, cuts = settled(switch.pivot), switch.cuts
+    low, high = pivot.range.lower, pivot.range.upper
+    first = low if i == 0 else larger(low, jnp.asarray(cuts[i - 1], low.dtype))
+    last = high if i == len(cuts) else smaller(high, jnp.asarray(cuts[i], low.dtype))
+    possible = first <= last
+    # Where the segment is out of reach anything will do: the cut itself.
+    stand_in = jnp.asarray(cuts[min(i, len(cuts) - 1)], low.dtype)
+    box = choose(possible, Interval.unchecked(first, last), Interval.unchecked(stand_in, stand_in))
+    cut_down = Node(box, _loose(pivot.form), pivot.jac)
+    replaced = [(switch.pivot, cut_down), (switch.node, _value(switch, switch.between[i]))]
+    found = again(replaced).equation(eqn, args)
+    node = settled(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
+    return _Case(jnp.broadcast_to(possible, plain.shape), box, node)
+
+
+def _loose(form: Form | None) -> Form | None:
+    """The form with numbers that are not known while tracing: else its image would stand for the range."""
+    if form is None:
+        return None
+    offset = Interval.unchecked(jnp.asarray(form.offset.lower), jnp.asarray(form.offset.upper))
+    return Form(jnp.asarray(form.slope), offset, form.box, form.slack)
+
+
+def _hull(plain: Node, switch: Switch, cases: Sequence[_Case], jumps: Sequence[tuple[Any, Any]]) -> Node:
+    pivot = settled(switch.pivot)
+    tolerance = max(_CONTINUOUS, 64 * float(jnp.finfo(plain.dtype).eps))
+    small = [jump <= tolerance * jnp.maximum(size, 1) for jump, size in jumps]
+    slip = sum(jnp.where(ok, jump, 0) for ok, (jump, _) in zip(small, jumps, strict=True))
+    natural = _met(_hull_of([(case.possible, case.node.range) for case in cases]), plain.range)
+    extra = rounding.generous(2 * slip) if rounding.outward() else 2 * slip
+    natural = Interval.unchecked(natural.lower - extra, natural.upper + extra)
+    box, jac = parts([plain, *(case.node for case in cases)])
+    form = None
+    if box is not None:
+        wide = move(lambda v: jnp.broadcast_to(v, plain.shape), pivot) if pivot.shape != plain.shape else pivot
+        form = _common_form(wide, cases, natural, extra, box)
+    if jac is not None:
+        size = jac.lower.shape[0]
+        jac = _hull_of([(case.possible, jac_of(case.node, size)) for case in cases])
+        for ok, cut in zip(small, switch.cuts, strict=True):
+            inside = (pivot.range.lower <= cut) & (pivot.range.upper >= cut)
+            jac = choose(jnp.broadcast_to(~inside | ok, jac.lower.shape), jac, entire_like(jac.lower))
+    return Node(natural, form, jac)
+
+
+def _hull_of(boxes: Sequence[tuple[Any, Interval]]) -> Interval:
+    """Hull of those that are possible."""
+    lower, upper = jnp.inf, -jnp.inf
+    for possible, box in boxes:
+        lower = smaller(lower, jnp.where(possible, box.lower, jnp.inf))
+        upper = larger(upper, jnp.where(possible, box.upper, -jnp.inf))
+    return Interval.unchecked(lower, upper)
+
+
+def _met(a: Interval, b: Interval) -> Interval:
+    """Intersection; the first where rounding makes the two miss each other."""
+    lower, upper = larger(a.lower, b.lower), smaller(a.upper, b.upper)
+    return choose(lower <= upper, Interval.unchecked(lower, upper), a)
+
+
+def _common_form(pivot: Node, cases: Sequence[_Case], natural: Interval, extra: Any, box: Any) -> Form:
+    """One slope for all pieces, each weighed with its share of the range of p: for pieces that are straight lines that
+    is the slope of the chord. What a piece has more or less of it goes to the offset, as a multiple of p where it is
+    one: p is known better on a segment than x is."""
+    slopes = [slope_of(case.node, box) for case in cases]
+    slope = sum(times(share, own) for share, own in zip(_shares(cases), slopes, strict=True))
+    along = slope_of(pivot, box)
+    length = (along * along).sum(0)
+    slack = sum((slack_of(case.node, own) for case, own in zip(cases, slopes, strict=True)), jnp.zeros_like(slope))
+    offsets = []
+    for case, own in zip(cases, slopes, strict=True):
+        # own - slope = part * (slope of p) + left, for any number `part`.
+        rest = own - slope
+        part = jnp.where(length > 0, (rest * along).sum(0) / jnp.where(length > 0, length, 1), 0)
+        part = jnp.where(jnp.isfinite(part), part, 0)
+        left = rest - part * along
+        # What these lines round; nothing in differences of equal numbers and with 0, nor in products with 1.
+        lost = 4 * float(jnp.finfo(slope.dtype).eps) * (abs(own) + abs(slope) + abs(part * along))
+        exact = (own == 0) | (slope == 0) | (own == slope)
+        exact &= (along == 0) | ((abs(along) == 1) & (left == 0))
+        lost = jnp.where(exact, 0, lost)
+        slack = slack + jax.lax.stop_gradient(lost) + abs(part) * slack_of(pivot, along)
+        moved = shift(case.pivot, Interval.unchecked(-pivot.offset.upper, -pivot.offset.lower))
+        up = part >= 0
+        scaled = Interval.unchecked(
+            rounding.down(times(part, jnp.where(up, moved.lower, moved.upper))),
+            rounding.up(times(part, jnp.where(up, moved.upper, moved.lower))),
+        )
+        scaled = choose(part == 0, Interval.unchecked(0 * part, 0 * part), scaled)
+        offset = shift(shift(case.node.offset, slope_image(left, box)), scaled)
+        offsets.append((case.possible, Interval.unchecked(offset.lower - extra, offset.upper + extra)))
+    return best_form(slope, _hull_of(offsets), natural, box, slack if rounding.outward() else None)
+
+
+def _shares(cases: Sequence[_Case]) -> list[Any]:
+    """Which share of the range of p every segment has; of infinite ones, all alike have all of it."""
+    lengths = [jnp.where(case.possible, case.pivot.upper - case.pivot.lower, 0) for case in cases]
+    infinite = [jnp.isinf(length) for length in lengths]
+    total = sum(jnp.where(inf, 0, length) for inf, length in zip(infinite, lengths, strict=True))
+    many, alive = sum(inf.astype(int) for inf in infinite), sum(case.possible.astype(int) for case in cases)
+    found = []
+    for case, inf, length in zip(cases, infinite, lengths, strict=True):
+        finite = jnp.where(total > 0, length / jnp.where(total > 0, total, 1), case.possible / jnp.maximum(alive, 1))
+        share = jnp.where(many > 0, inf / jnp.maximum(many, 1), finite)
+        found.append(jax.lax.stop_gradient(share.astype(length.dtype)))
+    return found
