@@ -38,7 +38,7 @@ from gsisio_jax.inclusion.rules import comparison, linear
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.scalar.unroll import numbers_in
+from gsisio_jax.scalar.unroll import called_jaxpr, numbers_in
 
 # Longer loops, and loops over more operations, are kept as loops: compile time grows with every unrolled turn.
 _UNROLL = 16
@@ -116,17 +116,11 @@ def _caller(eqn: Any) -> str | None:
     return None
 
 
-def _body(eqn: Any) -> tuple[Any, Sequence[Any]]:
-    """The jaxpr that a call primitive runs; its parameter's name moves between primitives and JAX versions."""
-    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-        if name in eqn.params:
-            inner = eqn.params[name]
-            return (inner.jaxpr, inner.consts) if isinstance(inner, jex.ClosedJaxpr) else (inner, ())
-    raise UnknownPrimitiveError(eqn.primitive.name, "without a body")
-
-
 def _call(eqn: Any, *args: Any) -> Any:
-    jaxpr, consts = _body(eqn)
+    try:
+        jaxpr, consts = called_jaxpr(eqn)
+    except LookupError:
+        raise UnknownPrimitiveError(eqn.primitive.name, "without a body") from None
     name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
     if name in LIBRARY and source.startswith(_JAX) and any(is_node(arg) for arg in args):
         return [settle(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
