@@ -24,8 +24,6 @@ from gsisio_jax.interval.box import Interval, faint
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
 
-FLUSHED = 2.0**60  # in smallest normal numbers
-
 
 class States(eqx.Module):
     """The box of x as atoms and rows use it: center, radius, `slip` = kappa m, and both sides widened by it.
@@ -73,7 +71,7 @@ def wider(size: Any, terms: int) -> Any:
         return jnp.zeros_like(size)
     info = jnp.finfo(size.dtype)
     kind = np.dtype(size.dtype).type
-    kappa, floor = kind((2 * terms + 16) * float(info.eps)), kind(FLUSHED * float(info.tiny))
+    kappa, floor = kind((2 * terms + 16) * float(info.eps)), kind(rounding.FLUSHED * float(info.tiny))
     return jax.lax.stop_gradient(size) * kappa + floor
 
 

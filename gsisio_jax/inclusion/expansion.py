@@ -229,7 +229,7 @@ class Expansion:
         usable, cx, cy, spread, natural = bilinear_line(x.range, y.range, kappa)
         size_x, size_y = (jnp.where(usable, jax.lax.stop_gradient(t.size), 0) + _crumb(t.size) for t in (x, y))
         size = size_x * size_y
-        pad = _padding(size, 32.0 + 8 * kappa, 2.0**60)
+        pad = _padding(size, 32.0 + 8 * kappa, rounding.FLUSHED)
         center, radius = cy * x.center + cx * y.center - cx * cy, spread
         for c, t in ((cy, x), (cx, y)):
             radius = radius if t.plain else radius + scale(abs(c), t.radius)
@@ -362,7 +362,7 @@ def _chosen(
         half = 0.5 * upper - 0.5 * lower
         middle = jnp.where(half < jnp.inf, 0.5 * lower + 0.5 * upper, 0)
         # Its own rounding, and rows of it.
-        half = half + _padding(far, 2 * kappa + 8, 2.0**60)
+        half = half + _padding(far, 2 * kappa + 8, rounding.FLUSHED)
         if best:
             usable = usable & (radius <= half + pad)
     center, radius = jnp.where(usable, center, middle), jnp.where(usable, radius + pad, half)

@@ -270,7 +270,7 @@ def widened(box: Interval, terms: int) -> Interval:
         return box
     info = jnp.finfo(box.dtype)
     kind = np.dtype(box.dtype).type
-    kappa, floor = kind((terms + 8) * float(info.eps)), kind(2.0**60 * float(info.tiny))
+    kappa, floor = kind((terms + 8) * float(info.eps)), kind(rounding.FLUSHED * float(info.tiny))
     lower, upper = (jax.lax.stop_gradient(abs(side)) * kappa + floor for side in (box.lower, box.upper))
     return Interval.unchecked(box.lower - lower, box.upper + upper)
 

@@ -47,6 +47,8 @@ Rounding = Literal["outward", "nearest"]
 _MODE: ContextVar[str] = ContextVar("gsisio_jax_rounding", default="outward")
 _NORMAL: ContextVar[bool] = ContextVar("gsisio_jax_normal", default=False)
 _FLOOR = 4.0  # smallest normal numbers that every widening adds
+FLUSHED = 2.0**60
+"""In smallest normal numbers: more than is lost where numbers are flushed to zero, in any sum of products; `generous`."""
 
 
 def check_rounding(call: str, rounding: str) -> None:
@@ -162,7 +164,7 @@ def generous(radius: Any) -> Any:
     thousandth is nothing.
     """
     kind = np.dtype(radius.dtype).type
-    return fusion_barrier(radius * kind(1 + 2.0**-10) + kind(2.0**60 * float(jnp.finfo(radius.dtype).tiny)))
+    return fusion_barrier(radius * kind(1 + 2.0**-10) + kind(FLUSHED * float(jnp.finfo(radius.dtype).tiny)))
 
 
 def sum_down(terms: Any, axis: int = -1) -> Any:

@@ -62,7 +62,7 @@ def bilinear_line(x: Interval, y: Interval, kappa: float) -> tuple[Any, Any, Any
     r, s = times(x.upper, y.lower), times(x.upper, y.upper)
     lower, upper = smaller(smaller(p, q), smaller(r, s)), larger(larger(p, q), larger(r, s))
     lower, upper = (
-        rounding.unbounded(move(side, 2.0 + kappa, 2.0**60), end)
+        rounding.unbounded(move(side, 2.0 + kappa, rounding.FLUSHED), end)
         for side, move, end in ((lower, rounding.down, -jnp.inf), (upper, rounding.up, jnp.inf))
     )
     largest = float(jnp.finfo(p.dtype).max) / 8

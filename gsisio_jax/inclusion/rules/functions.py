@@ -299,7 +299,7 @@ def _root_line(a: Any, b: Any, kappa: float) -> Line:
     that of the smallest normal number, which is in the floor."""
     u, v = jnp.sqrt(_positive(a)), jnp.sqrt(_positive(b))
     below = float(jnp.finfo(a.dtype).tiny) ** -0.5
-    floor = 2.0**60 + 4 * below
+    floor = rounding.FLUSHED + 4 * below
     inside = b >= 0
     lower = jnp.maximum(rounding.down(u, 4.0 + kappa, floor), 0)
     natural = Interval.unchecked(
@@ -327,8 +327,8 @@ def _exp_line(a: Any, b: Any, kappa: float) -> Line:
     a, above = jnp.minimum(jnp.maximum(a, -far), top), b >= top
     b = jnp.minimum(b, top)
     u, v = jnp.exp(a), jnp.exp(b)
-    lower = jnp.maximum(rounding.down(u, 8.0 + kappa, 2.0**60), 0)
-    natural = Interval.unchecked(lower, jnp.where(above, INF, rounding.up(v, 8.0 + kappa, 2.0**60)))
+    lower = jnp.maximum(rounding.down(u, 8.0 + kappa, rounding.FLUSHED), 0)
+    natural = Interval.unchecked(lower, jnp.where(above, INF, rounding.up(v, 8.0 + kappa, rounding.FLUSHED)))
     u, v = jnp.where(usable, u, 1), jnp.where(usable, v, 1)
     d = b - a
     wide = d > _narrow(a)
@@ -347,8 +347,8 @@ def _log_line(a: Any, b: Any, kappa: float) -> Line:
     a, b = _positive(a), _positive(jnp.where(above, b, 1))
     u, v = jnp.log(a), jnp.log(b)
     natural = Interval.unchecked(
-        jnp.where(known & ~missed, rounding.down(u, 8.0 + kappa, 2.0**60), -INF),
-        jnp.where(above & ~missed, rounding.up(v, 8.0 + kappa, 2.0**60), INF),
+        jnp.where(known & ~missed, rounding.down(u, 8.0 + kappa, rounding.FLUSHED), -INF),
+        jnp.where(above & ~missed, rounding.up(v, 8.0 + kappa, rounding.FLUSHED), INF),
     )
     d = b - a
     wide = d > _narrow(a) * b
@@ -365,8 +365,8 @@ def _reciprocal_line(a: Any, b: Any, kappa: float) -> Line:
     split, left = ((a < 0) & (b > 0)) | ((a == 0) & (b == 0)), b <= 0
     near, far = jnp.where(left, -b, a), jnp.where(left, -a, b)
     p, q = 1 / _positive(near), 1 / _positive(far)
-    low = jnp.maximum(rounding.down(q, 4.0 + kappa, 2.0**60), 0)
-    high = jnp.where(near >= tiny, rounding.up(p, 4.0 + kappa, 2.0**60), INF)
+    low = jnp.maximum(rounding.down(q, 4.0 + kappa, rounding.FLUSHED), 0)
+    high = jnp.where(near >= tiny, rounding.up(p, 4.0 + kappa, rounding.FLUSHED), INF)
     natural = Interval.unchecked(
         jnp.where(split, -INF, jnp.where(left, -high, low)), jnp.where(split, INF, jnp.where(left, -low, high))
     )
@@ -386,8 +386,8 @@ def _square_line(a: Any, b: Any, kappa: float) -> Line:
     a, b = jnp.minimum(a, far), jnp.maximum(b, -far)
     p, q = a * a, b * b
     least, most = jnp.where(inside, 0, smaller(p, q)), larger(p, q)
-    lower = jnp.maximum(rounding.down(least, 4.0 + kappa, 2.0**60), 0)
-    natural = Interval.unchecked(lower, jnp.where(finite, rounding.up(most, 4.0 + kappa, 2.0**60), INF))
+    lower = jnp.maximum(rounding.down(least, 4.0 + kappa, rounding.FLUSHED), 0)
+    natural = Interval.unchecked(lower, jnp.where(finite, rounding.up(most, 4.0 + kappa, rounding.FLUSHED), INF))
     m, r = 0.5 * (a + b), 0.5 * (b - a)
     half = 0.5 * (r * r)
     return Line(finite, 2 * m, half - m * m, half, most, natural, 32.0)
@@ -403,8 +403,8 @@ def _cube_line(a: Any, b: Any, kappa: float) -> Line:
     a, b = jnp.minimum(jnp.maximum(a, -far), far), jnp.minimum(jnp.maximum(b, -far), far)
     p, q = a * a * a, b * b * b
     natural = Interval.unchecked(
-        jnp.where(low, rounding.down(p, 6.0 + kappa, 2.0**60), -INF),
-        jnp.where(high, rounding.up(q, 6.0 + kappa, 2.0**60), INF),
+        jnp.where(low, rounding.down(p, 6.0 + kappa, rounding.FLUSHED), -INF),
+        jnp.where(high, rounding.up(q, 6.0 + kappa, rounding.FLUSHED), INF),
     )
     both = a * b
     s = a * a + b * b + both
@@ -431,7 +431,7 @@ def _bend_line(curve: Curve) -> Callable[[Any, Any, float], Line]:
         a, b = jnp.minimum(jnp.maximum(a, -far), far), jnp.minimum(jnp.maximum(b, -far), far)
         u, v = curve.phi.fn(a), curve.phi.fn(b)
         share = curve.phi.ulps + kappa
-        lower, upper = rounding.down(u, share, 2.0**60), rounding.up(v, share, 2.0**60)
+        lower, upper = rounding.down(u, share, rounding.FLUSHED), rounding.up(v, share, rounding.FLUSHED)
         if curve.phi.ends[0] == 0:
             lower = jnp.maximum(lower, 0)
         natural = Interval.unchecked(lower, upper)

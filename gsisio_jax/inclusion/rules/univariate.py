@@ -415,7 +415,7 @@ class Line(NamedTuple):
     size: Any
     range: Interval
     ulps: Any = 16.0
-    floor: float = 2.0**60
+    floor: float = rounding.FLUSHED
 
 
 def line_of(curve: Any, a: Any, b: Any, kappa: float) -> Line:
@@ -433,7 +433,7 @@ def line_of(curve: Any, a: Any, b: Any, kappa: float) -> Line:
     # phi = s t + rest is no larger than the rest and s t together, which is what this bound is used with.
     size = jnp.maximum(abs(low), abs(high))
     natural = Interval.unchecked(
-        rounding.down(natural.lower, kappa, 2.0**60), rounding.up(natural.upper, kappa, 2.0**60)
+        rounding.down(natural.lower, kappa, rounding.FLUSHED), rounding.up(natural.upper, kappa, rounding.FLUSHED)
     )
     natural = Interval.unchecked(rounding.unbounded(natural.lower, -INF), rounding.unbounded(natural.upper, INF))
     return Line(usable, s, 0.5 * low + 0.5 * high, 0.5 * high - 0.5 * low, size, natural, 4.0)
