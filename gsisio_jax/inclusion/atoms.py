@@ -147,7 +147,7 @@ def _sides(weights: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
     return low, scale(weights, jnp.where(up, upper, lower)).sum(-1)
 
 
-def widened(slope: Any, offset: Interval, natural: Interval, states: States, terms: int) -> AtomBounds:
+def widened_atoms(slope: Any, offset: Interval, natural: Interval, states: States, terms: int) -> AtomBounds:
     """Bounds of any functions as atoms: affine forms (J, n), (J,) and ranges, each valid by itself."""
     center, radius = offset.center, offset.radius
     size = scale(abs(slope), states.magnitude).sum(-1) + abs(center) + radius

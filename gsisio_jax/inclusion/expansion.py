@@ -30,7 +30,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, widened, wider
+from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, widened_atoms, wider
 from gsisio_jax.inclusion.linear_parts import Atom, Linear
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node
 from gsisio_jax.inclusion.rules.bilinear import bilinear_line, multiply
@@ -481,7 +481,7 @@ def _from_node(node: Node, states: States, terms: int) -> _Bounded:
         offset = natural
     else:
         slope, offset = node.form.slope, nan_to_unbounded(node.form.folded())
-    found = widened(slope, offset, natural, states, terms)
+    found = widened_atoms(slope, offset, natural, states, terms)
     parts = [np.asarray(slope[k]) if isinstance(slope, np.ndarray) else slope[k] for k in range(n)]
     return _Bounded(parts, found.center, found.radius, found.range)
 

@@ -259,7 +259,7 @@ def image(matrix: Any, x: Interval) -> Interval:
     return Interval.unchecked(rounding.sum_down(low), rounding.sum_up(high))
 
 
-def widened(box: Interval, terms: int) -> Interval:
+def widened_for_sums(box: Interval, terms: int) -> Interval:
     """The box, wider by what `plain_image` loses in a sum of so many terms, whatever the weights are.
 
     A sum of n products of weights that were rounded once is off by ``(n + 4) eps sum |w_i| |x_i|`` at most, and every
@@ -276,7 +276,7 @@ def widened(box: Interval, terms: int) -> Interval:
 
 
 def plain_image(matrix: Any, x: Interval) -> Interval:
-    """`image` of a box that has been through `widened`: sums as they come. NaN where it overflows."""
+    """`image` of a box that has been through `widened_for_sums`: sums as they come. NaN where it overflows."""
     low, high = products(matrix, x)
     floor = faint(matrix)
     return Interval.unchecked(low.sum(-1) - floor, high.sum(-1) + floor)

@@ -19,7 +19,7 @@ from gsisio_jax.interval.box import (
     reach,
     slip,
     spread,
-    widened,
+    widened_for_sums,
 )
 from gsisio_jax.observer.contractors import Affine, centred_form
 from gsisio_jax.observer.domain import Domain
@@ -73,7 +73,7 @@ def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: A
         chosen, N_z = jax.tree.map(lambda x: jnp.stack([x[k] for k in first.linear]), (right, gains.remainder))
         offset = image(-N_z, first.form.offset)
         shifted = Interval.unchecked(chosen.lower + offset.lower, chosen.upper + offset.upper)
-        boxes = plain_image(first.maps, widened(shifted, first.maps.shape[-1]))
+        boxes = plain_image(first.maps, widened_for_sums(shifted, first.maps.shape[-1]))
         if rounding.outward():
             far = jnp.minimum(spread(first.bounds, reach(boxes)), reach(domain.box))
             left = slip(first.left, far)

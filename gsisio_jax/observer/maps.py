@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, widened, wider
+from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, widened_atoms, wider
 from gsisio_jax.inclusion.expansion import Expansion
 from gsisio_jax.inclusion.intersection import DEFAULT, bound
 from gsisio_jax.inclusion.reader import expand
@@ -82,7 +82,7 @@ class Maps:
         if self.expansion is not None:
             return self.expansion.bounds(states, u, with_values=promised)
         form = bound(observer.system.maps, observer.bounds, observer.abstraction)(box, u)
-        found = widened(form.slope, form.offset, form.range, states, self.terms)
+        found = widened_atoms(form.slope, form.offset, form.range, states, self.terms)
         value, slip = self._at(observer.system.maps, states.center, u) if promised else (None, None)
         return replace(found, value=value, slip=slip)
 
@@ -92,7 +92,7 @@ class Maps:
             return self.expansion.bounds(states, u, self.expansion.used_by(self.free))
         observer = self.observer
         form = bound(self._free_map, observer.bounds, observer.output_abstraction)(box, u)
-        return widened(form.slope, form.offset, form.range, states, self.terms)
+        return widened_atoms(form.slope, form.offset, form.range, states, self.terms)
 
     def free_at(self, x: Any, u: Any) -> tuple[Any, Any]:
         """Atoms of T2 g at a point, and what rounding leaves of them."""

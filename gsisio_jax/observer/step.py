@@ -23,7 +23,7 @@ from gsisio_jax.interval.box import (
     is_concrete,
     nan_to_unbounded,
     plain_image,
-    widened,
+    widened_for_sums,
 )
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
@@ -87,7 +87,7 @@ def _known(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) -> Kn
         terms,
         observer.gains.linear(terms),
         observer.inverses.linear(terms),
-        plain_image(observer.T2, widened(output, system.l)),
+        plain_image(observer.T2, widened_for_sums(output, system.l)),
     )
 
 
@@ -219,6 +219,6 @@ def _current_input(maps: Maps, states: States, h: AtomBounds, output: Interval, 
     xp = np if is_concrete(current) else jnp
     weights = xp.concatenate([xp.zeros((current.shape[0], n)), -current], 1)
     found = maps.rows(weights).bounds(states, h)
-    seen = plain_image(current, widened(output, output.shape[0]))
+    seen = plain_image(current, widened_for_sums(output, output.shape[0]))
     now = Interval.unchecked(found.lower + seen.lower, found.upper + seen.upper)
     return everything_unless(believed, nan_to_unbounded(now))
