@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, faint
+from gsisio_jax.interval.box import Interval, center_and_radius, faint, plain_sums
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
 
@@ -40,8 +40,7 @@ class States(eqx.Module):
     @classmethod
     def of(cls, box: Interval, terms: int) -> States:
         box = Interval.unchecked(jnp.asarray(box.lower), jnp.asarray(box.upper))
-        radius = 0.5 * (box.upper - box.lower)
-        center = jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0)
+        center, radius = center_and_radius(box)
         magnitude = abs(center) + radius
         slip = wider(magnitude, terms)
         return cls(center, radius + slip, magnitude, slip, Interval.unchecked(box.lower - slip, box.upper + slip))
@@ -130,7 +129,7 @@ class Rows(eqx.Module):
         weights = jnp.concatenate([jnp.asarray(self.states), jnp.asarray(self.atoms)], -1)
         lower = jnp.concatenate([states.wide.lower, atoms.range.lower])
         upper = jnp.concatenate([states.wide.upper, atoms.range.upper])
-        low, high = _sides(weights, lower, upper)
+        low, high = plain_sums(weights, Interval.unchecked(lower, upper))
         slip = of_constant(self.constant) + self._faint() if self.lost is None else self.slip(states, atoms)
         return Interval.unchecked(low + (self.constant - slip), high + (self.constant + slip))
 
@@ -138,13 +137,6 @@ class Rows(eqx.Module):
         """The intersection of both, box (r,)."""
         joint, natural = self.joint_box(states, atoms), self.natural(states, atoms)
         return Interval.unchecked(raised(natural.lower, joint.lower), cut(natural.upper, joint.upper))
-
-
-def _sides(weights: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
-    """Both sides of the image of a box that has been widened beforehand."""
-    up = weights >= 0
-    low = scale(weights, jnp.where(up, lower, upper)).sum(-1)
-    return low, scale(weights, jnp.where(up, upper, lower)).sum(-1)
 
 
 def widened_atoms(slope: Any, offset: Interval, natural: Interval, states: States, terms: int) -> AtomBounds:

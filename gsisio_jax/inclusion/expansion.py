@@ -40,7 +40,7 @@ from gsisio_jax.inclusion.rules.sincos import LIMIT
 from gsisio_jax.inclusion.rules.trig import Wave, wave_atom, wave_point
 from gsisio_jax.inclusion.rules.univariate import Line, apply, line_of
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, faint, is_concrete, nan_to_unbounded
+from gsisio_jax.interval.box import Interval, center_and_radius, choose, faint, is_concrete, nan_to_unbounded
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
 
@@ -442,8 +442,7 @@ def _values(found: list[Any], dtype: Any) -> tuple[Any, Any]:
     pairs = []
     for v in found:
         if isinstance(v, Interval):
-            slip = 0.5 * (v.upper - v.lower)
-            v = jnp.where(slip < jnp.inf, 0.5 * (v.lower + v.upper), 0), slip
+            v = center_and_radius(v)
         pairs.append(v)
     value, slip = (jnp.stack([jnp.asarray(pair[i], dtype) for pair in pairs]) for i in (0, 1))
     return value, slip

@@ -18,7 +18,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.minmax import larger, smaller
+from gsisio_jax.interval.minmax import cut, larger, raised, smaller
 from gsisio_jax.interval.primitives import add_up, fusion_barrier, scale
 
 
@@ -277,9 +277,15 @@ def widened_for_sums(box: Interval, terms: int) -> Interval:
 
 def plain_image(matrix: Any, x: Interval) -> Interval:
     """`image` of a box that has been through `widened_for_sums`: sums as they come. NaN where it overflows."""
-    low, high = products(matrix, x)
+    low, high = plain_sums(matrix, x)
     floor = faint(matrix)
-    return Interval.unchecked(low.sum(-1) - floor, high.sum(-1) + floor)
+    return Interval.unchecked(low - floor, high + floor)
+
+
+def plain_sums(matrix: Any, x: Interval) -> tuple[Any, Any]:
+    """Both sides of ``matrix @ x``, sums as they come; without the `faint`."""
+    low, high = products(matrix, x)
+    return low.sum(-1), high.sum(-1)
 
 
 def faint(weights: Any) -> Any:
@@ -350,6 +356,12 @@ def reach(box: Interval) -> Any:
     return jnp.maximum(abs(box.lower), abs(box.upper))
 
 
+def center_and_radius(box: Interval) -> tuple[Any, Any]:
+    """Center and radius of a traced box, to nearest; an infinite side makes the radius infinite and the center 0."""
+    radius = 0.5 * (box.upper - box.lower)
+    return jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0), radius
+
+
 def entire_like(box: Any) -> Interval:
     """All of R^n, in the shape and type of a box or an array."""
     like = box.lower if isinstance(box, Interval) else box
@@ -376,9 +388,10 @@ def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
     Returns:
         The intersection, and the slack ``min(a.upper - b.lower, b.upper - a.lower)``: how far one box could be moved
         before they miss each other. A negative slack is the size of the gap; there the first box is returned
-        unchanged, so the result is never crossed: the caller must look at the slack.
+        unchanged, so the result is never crossed: the caller must look at the slack. A side of b that is NaN (it
+        overflowed) is passed over.
     """
     slack = smaller(a.upper - b.lower, b.upper - a.lower)
-    empty = slack < 0
-    lower, upper = larger(a.lower, b.lower), smaller(a.upper, b.upper)
+    lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
+    empty = upper < lower
     return Interval.unchecked(jnp.where(empty, a.lower, lower), jnp.where(empty, a.upper, upper)), slack

@@ -48,7 +48,7 @@ _MODE: ContextVar[str] = ContextVar("gsisio_jax_rounding", default="outward")
 _NORMAL: ContextVar[bool] = ContextVar("gsisio_jax_normal", default=False)
 _FLOOR = 4.0  # smallest normal numbers that every widening adds
 FLUSHED = 2.0**60
-"""In smallest normal numbers: more than is lost where numbers are flushed to zero, in any sum of products; `generous`."""
+"""Smallest normal numbers that cover whatever is lost where the terms of a sum are flushed to zero; see `generous`."""
 
 
 def check_rounding(call: str, rounding: str) -> None:

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax.inclusion.atoms import States, wider
-from gsisio_jax.interval.box import Interval, choose, plain_image
-from gsisio_jax.interval.minmax import cut, raised, smaller
+from gsisio_jax.interval.box import Interval, choose, intersect, plain_image
 from gsisio_jax.interval.primitives import matmul
 from gsisio_jax.observer.bank import Known
 from gsisio_jax.observer.contractors import centred_form
@@ -49,7 +48,7 @@ def certified(
     gains, constants = observer.gains, observer.rounding_constants
     around = _around(maps, gains.residual[0], constants.growth, promised, known.right[0])
     around = plainly_wider(around, _first(left))
-    joint, slack = _met(right[0], around)
+    joint, slack = intersect(right[0], around)
     domain = domain.record_margin(jnp.where(applies, slack, jnp.inf), Source.STATE)
     joint = choose(applies, joint, Interval.unchecked(c, c))
     safe = choose(applies, domain.box, Interval.unchecked(c, c))
@@ -59,14 +58,6 @@ def certified(
 
     box = centred_form(joint, gains.remainder[0], observer.region_inverse, psi, safe, maps.terms)
     return domain.intersect(everything_unless(applies, box)[None], Source.CERTIFICATE), promised
-
-
-def _met(a: Interval, b: Interval) -> tuple[Interval, Any]:
-    """Intersection and slack; the first box where they miss each other."""
-    lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
-    empty = upper < lower
-    slack = smaller(a.upper - b.lower, b.upper - a.lower)
-    return Interval.unchecked(jnp.where(empty, a.lower, lower), jnp.where(empty, a.upper, upper)), slack
 
 
 def _around(maps: Maps, weights: Any, slope: Any, promised: Promised, known: Interval) -> Interval:
@@ -102,5 +93,5 @@ def certified_input(
     around = plainly_wider(around, _first(left))
     now = plain_image(inverses.state[0], states.wide)
     box = Interval.unchecked(now.lower + around.lower, now.upper + around.upper)
-    met, slack = _met(d, everything_unless(promised.applies, box))
+    met, slack = intersect(d, everything_unless(promised.applies, box))
     return met, domain.record_margin(slack, Source.INPUT)
