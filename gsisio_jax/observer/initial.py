@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,16 +29,33 @@ from gsisio_jax.observer.status import Source
 from gsisio_jax.observer.types import Observer
 
 
-def first_form(observer: Observer, box: Interval, u: Any) -> Affine:
-    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes. For x in `box`."""
-    known, slack = observer.first.form, observer.first.slack
-    if known is None:
-        function = affine_with_slack(lambda x, u: observer.T2 @ observer.system.measurement(x, u))
-        known, slack = function(observer.system.state_bounds, u)
-    center, radius = known.offset.center, known.offset.radius
-    if rounding.outward():
-        radius = radius + wider(abs(center) + jnp.where(jnp.isfinite(radius), radius, 0), 0) + slip(slack, reach(box))
-    return Affine(known.slope, center, radius)
+class FirstForm(NamedTuple):
+    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes.
+
+    The radius lacks what the slope is off by, which is `slack` (q, n) times ``|x|``; see `on`.
+    """
+
+    slope: Any
+    center: Any
+    radius: Any
+    slack: Any
+
+    @classmethod
+    def of(cls, observer: Observer, u: Any) -> FirstForm:
+        """As the design has left it; where g takes u, for the u of this step."""
+        known, slack = observer.first.form, observer.first.slack
+        if known is None:
+            function = affine_with_slack(lambda x, u: observer.T2 @ observer.system.measurement(x, u))
+            known, slack = function(observer.system.state_bounds, u)
+        center, radius = known.offset.center, known.offset.radius
+        if rounding.outward():
+            radius = radius + wider(abs(center) + jnp.where(jnp.isfinite(radius), radius, 0), 0)
+        return cls(known.slope, center, radius, slack)
+
+    def on(self, box: Interval) -> Affine:
+        """For x in `box`, a part of the state bounds."""
+        radius = self.radius + slip(self.slack, reach(box)) if rounding.outward() else self.radius
+        return Affine(self.slope, self.center, radius)
 
 
 def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: Any) -> Domain:

@@ -105,6 +105,11 @@ class Maps:
         extra = wider(reach(value), self.terms)
         return value.center, value.radius + extra
 
+    def on_outputs(self, weights: Any) -> Any:
+        """Weights (r, l) of g as weights (r, n + l) of [f; g]."""
+        xp = np if is_concrete(weights) else jnp
+        return xp.concatenate([xp.zeros((weights.shape[0], self.observer.system.n)), weights], axis=1)
+
     def rows(self, weights: Any) -> Rows:
         """``weights @ [f; g]`` for weights (r, n + l), over `bounds`."""
         if self.expansion is not None:
@@ -122,11 +127,9 @@ class Maps:
         return self._free_rows(self.observer.C)
 
     def _free_rows(self, minus: Any) -> Rows:
-        T2, n = self.observer.T2, self.observer.system.n
+        T2 = self.observer.T2
         if self.expansion is not None:
-            xp = np if is_concrete(T2) else jnp
-            weights = xp.concatenate([xp.zeros((T2.shape[0], n)), T2], axis=1)
-            return self.expansion.rows(weights, self.dtype, minus)
+            return self.expansion.rows(self.on_outputs(T2), self.dtype, minus)
         return self._over_arrays(jnp.eye(T2.shape[0], dtype=self.dtype), minus)
 
     def _over_arrays(self, weights: Any, minus: Any) -> Rows:
