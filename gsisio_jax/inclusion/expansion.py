@@ -280,7 +280,7 @@ class Expansion:
         size: Any = kind(abs(float(t.constant)))
         for k, value in t.coefficients.items():
             weight = kind(abs(float(value)))
-            size = size + weight * (states.magnitude[k] if k < self.n else found[k - self.n].reach(states))
+            size = size + weight * (states.magnitude[k] if k < self.n else found[k - self.n].magnitude(states))
             if k < self.n:
                 slope[k] = np.asarray(value, dtype)
                 inexact = value != Fraction(float(slope[k])) or len(t.coefficients) > 1 or inner
@@ -418,7 +418,7 @@ class _Bounded:
     value: Any = None
     size: Any = None
 
-    def reach(self, states: States) -> Any:
+    def magnitude(self, states: States) -> Any:
         """The q of an atom, at least its range: ``sum |slope_i| m_i + |center| + radius``."""
         if self.size is None:
             size = jnp.maximum(abs(self.range.lower), abs(self.range.upper))

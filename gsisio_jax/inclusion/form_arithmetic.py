@@ -159,8 +159,8 @@ def slope_image(slope: Any, box: Any) -> Interval:
 
 
 def slope_reach(slope: Any, box: Any) -> Any:
-    """``sum |slope| reach``, to nearest; ``0 * inf = 0``."""
-    far = jnp.reshape(box.reach, (-1,) + (1,) * (slope.ndim - 1))
+    """``sum |slope| magnitude``, to nearest; ``0 * inf = 0``."""
+    far = jnp.reshape(box.magnitude, (-1,) + (1,) * (slope.ndim - 1))
     size = abs(slope)
     no_zero = is_known(size) and size.all()
     terms = size * far if no_zero else jnp.where(size == 0, 0, size * far)

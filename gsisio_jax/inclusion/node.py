@@ -11,8 +11,9 @@ Inside the engine the axis over the entries of ``x`` comes first, so that slopes
 
 Rounding: ranges, offsets and Jacobians are boxes, rounded outward by every operation here (see
 `gsisio_jax.interval.rounding`). A slope is rounded to nearest, and what that may have lost is kept beside it, as
-`slack`: times the reach of the box it belongs to the offset. Kept apart, because the box may be infinite, and because
-slopes of linear functions are often exact: then the form of such a function on an infinite box stays what it is.
+`slack`: times the magnitude of the box it belongs to the offset. Kept apart, because the box may be infinite, and
+because slopes of linear functions are often exact: then the form of such a function on an infinite box stays what it
+is.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from gsisio_jax.inclusion.form_arithmetic import (
     spare,
 )
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, held, reach
+from gsisio_jax.interval.box import Interval, choose, computed_once, magnitude
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import add_up, fusion_barrier
 
@@ -56,11 +57,11 @@ class InputBox(eqx.Module):
 
     lower: Any
     upper: Any
-    reach: Any
+    magnitude: Any
 
     @classmethod
     def of(cls, box: Interval) -> InputBox:
-        return cls(box.lower, box.upper, abs(box.lower) if is_point(box) else reach(box))
+        return cls(box.lower, box.upper, abs(box.lower) if is_point(box) else magnitude(box))
 
 
 class Form(eqx.Module):
@@ -169,7 +170,7 @@ class Node(eqx.Module):
         if self.given is None:
             assert self.form is not None
             image = guard(self.form.image())
-            object.__setattr__(self, "given", image if is_known(image.lower) else held(image))
+            object.__setattr__(self, "given", image if is_known(image.lower) else computed_once(image))
         assert self.given is not None
         return self.given
 
@@ -208,9 +209,8 @@ def meet(node: Node) -> Node:
         return node
     natural, image = node.range, node.form.image()
     lower, upper = larger(natural.lower, image.lower), smaller(natural.upper, image.upper)
-    return Node(
-        held(choose(lower <= upper, Interval.unchecked(lower, upper), natural)), node.form, node.jac, node.unnormalised
-    )
+    met = choose(lower <= upper, Interval.unchecked(lower, upper), natural)
+    return Node(computed_once(met), node.form, node.jac, node.unnormalised)
 
 
 def best_form(slope: Any, offset: Interval, natural: Interval, box: InputBox, slack: Any = None, size: Any = 0) -> Form:
@@ -225,7 +225,7 @@ def best_form(slope: Any, offset: Interval, natural: Interval, box: InputBox, sl
     loss = _LOSS * jnp.finfo(width.dtype).eps * jax.lax.stop_gradient(size)
     good = jnp.isfinite(width) & (width - loss <= natural.upper - natural.lower)
     slack = None if slack is None else jnp.where(good, slack, 0)
-    return Form(fusion_barrier(jnp.where(good, slope, 0)), held(choose(good, offset, natural)), box, slack)
+    return Form(fusion_barrier(jnp.where(good, slope, 0)), computed_once(choose(good, offset, natural)), box, slack)
 
 
 def unsettled(given: Interval | None, form: Form | None, jac: Interval | None) -> Node:

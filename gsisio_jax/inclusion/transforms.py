@@ -203,7 +203,7 @@ def _in_type(node: Node, dtype: Any) -> Node:
         lost = abs(slope) * np.dtype(dtype).type(2 * jnp.finfo(dtype).eps)
         slack = sum_slack(lost, None if form.slack is None else (2 * form.slack).astype(dtype))
         domain = InputBox(
-            *(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.reach))
+            *(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.magnitude))
         )
         form = Form(slope, form.offset.astype(dtype), domain, slack)
     return Node(node.range.astype(dtype), form, None if node.jac is None else node.jac.astype(dtype))

@@ -307,15 +307,15 @@ def products(matrix: Any, x: Interval) -> tuple[Any, Any]:
     return jnp.where(up, at_lower, at_upper), jnp.where(up, at_upper, at_lower)
 
 
-def spread(matrix: Any, reach: Any) -> Any:
-    """Upper bound of ``matrix @ reach`` for a nonnegative matrix (..., m, n) and reach (n,) or (..., n)."""
-    return rounding.sum_up(scale(matrix, reach[..., None, :]))
+def matvec_upper(matrix: Any, magnitude: Any) -> Any:
+    """Upper bound of ``matrix @ magnitude`` for a nonnegative matrix (..., m, n) and magnitude (n,) or (..., n)."""
+    return rounding.sum_up(scale(matrix, magnitude[..., None, :]))
 
 
-def slip(matrix: Any, reach: Any) -> Any:
-    """`spread` for matrices of the size of rounding, with less work and a thousandth more (`rounding.generous`);
+def loose_matvec_upper(matrix: Any, magnitude: Any) -> Any:
+    """`matvec_upper` for matrices of the size of rounding, with less work and a thousandth more (`rounding.generous`);
     exactly 0 for rows of zeros."""
-    found = rounding.generous(add_up(scale(matrix, reach[..., None, :])))
+    found = rounding.generous(add_up(scale(matrix, magnitude[..., None, :])))
     return jnp.where((matrix != 0).any(-1), found, 0)
 
 
@@ -334,7 +334,7 @@ def _add_down(values: list[Any]) -> Any:
     return rounding.lowered(total, size, len(values))
 
 
-def held(box: Interval) -> Interval:
+def computed_once(box: Interval) -> Interval:
     """The box itself, whose bounds are computed once however often they are used; see `once`."""
     return Interval.unchecked(fusion_barrier(box.lower), fusion_barrier(box.upper))
 
@@ -351,7 +351,7 @@ def widen(box: Interval, radius: Any) -> Interval:
     return box if radius is None else add(box, Interval.unchecked(-radius, radius))
 
 
-def reach(box: Interval) -> Any:
+def magnitude(box: Interval) -> Any:
     """Largest magnitude in the box, elementwise."""
     return jnp.maximum(abs(box.lower), abs(box.upper))
 

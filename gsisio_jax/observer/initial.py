@@ -15,10 +15,10 @@ from gsisio_jax.interval.box import (
     choose,
     entire_like,
     image,
+    loose_matvec_upper,
+    magnitude,
+    matvec_upper,
     plain_image,
-    reach,
-    slip,
-    spread,
     widened_for_sums,
 )
 from gsisio_jax.observer.contractors import Affine, centred_form
@@ -54,7 +54,7 @@ class FirstForm(NamedTuple):
 
     def on(self, box: Interval) -> Affine:
         """For x in `box`, a part of the state bounds."""
-        radius = self.radius + slip(self.slack, reach(box)) if rounding.outward() else self.radius
+        radius = self.radius + loose_matvec_upper(self.slack, magnitude(box)) if rounding.outward() else self.radius
         return Affine(self.slope, self.center, radius)
 
 
@@ -72,7 +72,7 @@ def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: A
     observer = maps.observer
     first, gains = observer.first, observer.gains
     if rounding.outward():
-        lost = slip(observer.rounding_constants.gains.d, inputs)
+        lost = loose_matvec_upper(observer.rounding_constants.gains.d, inputs)
         right = Interval.unchecked(right.lower - lost, right.upper + lost)
     for i, k in enumerate(first.gains):
         if k in first.linear:
@@ -92,8 +92,8 @@ def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: A
         shifted = Interval.unchecked(chosen.lower + offset.lower, chosen.upper + offset.upper)
         boxes = plain_image(first.maps, widened_for_sums(shifted, first.maps.shape[-1]))
         if rounding.outward():
-            far = jnp.minimum(spread(first.bounds, reach(boxes)), reach(domain.box))
-            left = slip(first.left, far)
+            far = jnp.minimum(matvec_upper(first.bounds, magnitude(boxes)), magnitude(domain.box))
+            left = loose_matvec_upper(first.left, far)
             boxes = Interval.unchecked(boxes.lower - left, boxes.upper + left)
         domain = domain.intersect(boxes, Source.STATE)
     return domain

@@ -18,7 +18,7 @@ from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, wi
 from gsisio_jax.inclusion.expansion import Expansion
 from gsisio_jax.inclusion.intersection import DEFAULT, bound
 from gsisio_jax.inclusion.reader import expand
-from gsisio_jax.interval.box import Interval, is_concrete, reach
+from gsisio_jax.interval.box import Interval, is_concrete, magnitude
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.measurement import value_at
 from gsisio_jax.observer.types import Observer
@@ -102,7 +102,7 @@ class Maps:
 
     def _at(self, function: Any, x: Any, u: Any) -> tuple[Any, Any]:
         value = value_at(function, x, u)
-        extra = wider(reach(value), self.terms)
+        extra = wider(magnitude(value), self.terms)
         return value.center, value.radius + extra
 
     def on_outputs(self, weights: Any) -> Any:

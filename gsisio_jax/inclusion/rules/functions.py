@@ -102,7 +102,7 @@ SIN, COS = Wave(False), Wave(True)
 TAN = Tangent()
 
 SQUARE = Curve(Piece(jnp.square, "valley", (INF, INF)), Piece(lambda t: 2 * t, "up", (-INF, INF)))
-_GROWTH = Piece(jnp.exp, "up", (0.0, INF), reach=_log_max, ulps=8.0)
+_GROWTH = Piece(jnp.exp, "up", (0.0, INF), overflow=_log_max, ulps=8.0)
 EXP = Curve(_GROWTH, _GROWTH, _log)
 LOG = Curve(
     Piece(jnp.log, "up", (-INF, INF), domain=POSITIVE, ulps=8.0),
@@ -132,10 +132,10 @@ def power(p: float) -> Any:
 
     q = p - 1.0
 
-    def reach(largest: float) -> float:
+    def overflow(largest: float) -> float:
         return largest ** (1 / p) if p > 1 else INF
 
-    def slope_reach(largest: float) -> float:
+    def slope_overflow(largest: float) -> float:
         return (largest / p) ** (1 / q) if q > 0 else INF
 
     if p == int(p):
@@ -145,14 +145,14 @@ def power(p: float) -> Any:
             lambda t: jax.lax.integer_pow(t, p),
             "valley" if even else "up",
             (INF if even else -INF, INF),
-            reach=reach,
+            overflow=overflow,
             ulps=p + 4.0,
         )
         slope = Piece(
             lambda t: p * jax.lax.integer_pow(t, q),
             "up" if even else "valley",
             (-INF if even else INF, INF),
-            reach=slope_reach,
+            overflow=slope_overflow,
             ulps=p + 4.0,
             floor=p + 16.0,
         )
@@ -166,16 +166,16 @@ def power(p: float) -> Any:
     # Where p - 1 is no floating number, its rounding counts as often as log t is large.
     ulps = 16.0 if p >= 0.5 else 1024.0
     ends = (0.0, INF) if p > 0 else (INF, 0.0)
-    phi = Piece(lambda t: t**p, "up" if p > 0 else "down", ends, domain=POSITIVE, reach=reach, ulps=16.0)
+    phi = Piece(lambda t: t**p, "up" if p > 0 else "down", ends, domain=POSITIVE, overflow=overflow, ulps=16.0)
     bend = (0.0, INF) if q > 0 else ((INF, 0.0) if p > 0 else (-INF, 0.0))
     trend = "up" if q > 0 or p < 0 else "down"
-    slope = Piece(lambda t: p * t**q, trend, bend, domain=POSITIVE, reach=slope_reach, ulps=ulps)
+    slope = Piece(lambda t: p * t**q, trend, bend, domain=POSITIVE, overflow=slope_overflow, ulps=ulps)
     return Curve(phi, slope, lambda s: jnp.exp(_log(s / p) / q))
 
 
 CUBE = power(3.0)
-_SINH = Piece(jnp.sinh, "up", (-INF, INF), reach=_log_max, ulps=16.0, drift=_linear_drift)
-_COSH = Piece(jnp.cosh, "valley", (INF, INF), 1.0, reach=_log_max, ulps=16.0, drift=_linear_drift)
+_SINH = Piece(jnp.sinh, "up", (-INF, INF), overflow=_log_max, ulps=16.0, drift=_linear_drift)
+_COSH = Piece(jnp.cosh, "valley", (INF, INF), 1.0, overflow=_log_max, ulps=16.0, drift=_linear_drift)
 
 CURVES: dict[str, Any] = {
     "sin": SIN,
@@ -188,11 +188,11 @@ CURVES: dict[str, Any] = {
     "sqrt": SQRT,
     "rsqrt": power(-0.5),
     "exp2": Curve(
-        Piece(jnp.exp2, "up", (0.0, INF), reach=math.log2, ulps=8.0, drift=_linear_drift),
-        Piece(lambda t: _LOG2 * jnp.exp2(t), "up", (0.0, INF), reach=math.log2, ulps=8.0, drift=_linear_drift),
+        Piece(jnp.exp2, "up", (0.0, INF), overflow=math.log2, ulps=8.0, drift=_linear_drift),
+        Piece(lambda t: _LOG2 * jnp.exp2(t), "up", (0.0, INF), overflow=math.log2, ulps=8.0, drift=_linear_drift),
         lambda s: _log(s / _LOG2) / _LOG2,
     ),
-    "expm1": Curve(Piece(jnp.expm1, "up", (-1.0, INF), reach=_log_max, ulps=16.0), _GROWTH, _log),
+    "expm1": Curve(Piece(jnp.expm1, "up", (-1.0, INF), overflow=_log_max, ulps=16.0), _GROWTH, _log),
     "log1p": Curve(
         Piece(jnp.log1p, "up", (-INF, INF), domain=(-1.0, INF), ulps=512.0),
         Piece(lambda t: 1 / (1 + t), "down", (INF, 0.0), domain=(-1.0, INF)),

@@ -146,10 +146,10 @@ def wave_atom(cosine: bool, m: Any, r: Any, size: Any, terms: int) -> tuple[Any,
     even = value * turned
     center = value - bent - slope * m  # halfway between value and even, which are 2 bent apart
     radius = abs(bent) + odd + pad
-    reach = 2 * steep * half_sin * half_cos + pad
+    half = 2 * steep * half_sin * half_cos + pad
     limit = turned - pad
-    lower = jnp.where(usable & (-value < limit), even - reach, -1)
-    upper = jnp.where(usable & (value < limit), even + reach, 1)
+    lower = jnp.where(usable & (-value < limit), even - half, -1)
+    upper = jnp.where(usable & (value < limit), even + half, 1)
     natural = Interval.unchecked(larger(lower, -1), smaller(upper, 1))
     middle = jnp.where(usable, value, 0), jnp.where(usable, pad, 1)
     slope, center = jnp.where(usable, slope, 0), jnp.where(usable, center, 0)

@@ -35,7 +35,7 @@ from gsisio_jax.inclusion.node import POINT_MODE, Node, best_form, chain, settle
 from gsisio_jax.inclusion.rules.sincos import LIMIT
 from gsisio_jax.inclusion.rules.trig import Wave, crosses
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, entire_like, held
+from gsisio_jax.interval.box import Interval, choose, computed_once, entire_like
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import fusion_barrier, times
 
@@ -52,14 +52,14 @@ def apply(curve: Any, x: Node) -> Node:
     if getattr(curve, "steep", False):
         a, b = _calm(a), _calm(b)
     if isinstance(curve, Wave) and POINT_MODE.get():
-        return Node(held(curve.near(a, b)))
+        return Node(computed_once(curve.near(a, b)))
     # What range, line and derivative of a wave have in common is computed once.
     shared = (curve.parts(a, b),) if isinstance(curve, Wave) else ()
-    natural = held(guard(curve.range(a, b, *shared)))
+    natural = computed_once(guard(curve.range(a, b, *shared)))
     form = None
     if x.form is not None and not POINT_MODE.get():
         s, rest = curve.line(a, b, natural, *shared)
-        s, rest = fusion_barrier(s), held(rest)
+        s, rest = fusion_barrier(s), computed_once(rest)
         slope, offset = s * x.form.slope, x.form.offset
         up = s >= 0
         first, last = (times(s, jnp.where(mask, offset.lower, offset.upper)) for mask in (up, ~up))
@@ -69,7 +69,7 @@ def apply(curve: Any, x: Node) -> Node:
             upper = rounding.raised(upper, abs(last) + abs(upper), 2.0)
             slack = scaled_slack(s, x.form.slope, slope, x.form.slack)
             size = slope_reach(slope, x.form.box)
-        form = best_form(slope, held(Interval.unchecked(lower, upper)), natural, x.form.box, slack, size)
+        form = best_form(slope, computed_once(Interval.unchecked(lower, upper)), natural, x.form.box, slack, size)
     return Node(natural, form, None if x.jac is None else chain(guard(curve.derivative(a, b, *shared)), x.jac))
 
 
@@ -98,7 +98,7 @@ class Piece:
         turn: value at 0, for a valley or a peak.
         domain: where the function is defined.
         inner: a point inside the domain, evaluated in place of points outside so that gradients stay finite.
-        reach: given the largest number of the floating type, from where on ``ends`` is used.
+        overflow: given the largest number of the floating type, from where on ``ends`` is used.
         ulps: bound of the error of `fn` in eps of its value, see `functions`.
         drift: what is to be added to `ulps` for an argument of that magnitude, nondecreasing.
         floor: bound of what is lost where intermediate results are flushed to zero, in smallest normal numbers.
@@ -110,7 +110,7 @@ class Piece:
     turn: float = 0.0
     domain: tuple[float, float] = (-INF, INF)
     inner: float = 0.5
-    reach: Callable[[float], float] | None = None
+    overflow: Callable[[float], float] | None = None
     ulps: float = 4.0
     drift: Callable[[Any], Any] | None = None
     floor: float = 16.0
@@ -119,8 +119,8 @@ class Piece:
         """Value at t, the limit at and beyond the ends of the domain."""
         low, high = self.domain
         inside = (t > low) & (t < high)
-        if self.reach is not None:
-            inside &= jnp.abs(t) < self.reach(float(jnp.finfo(t.dtype).max))
+        if self.overflow is not None:
+            inside &= jnp.abs(t) < self.overflow(float(jnp.finfo(t.dtype).max))
         if self.turn == INF or self.turn == -INF:
             inside &= t != 0
         value = self.fn(jnp.where(inside, t, self.inner))
