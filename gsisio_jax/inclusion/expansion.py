@@ -166,9 +166,9 @@ class Expansion:
         """Range of an argument from ranges that were widened before."""
         dtype = wide.lower.dtype
         kind = np.dtype(dtype).type
-        constant, slip = kind(t.constant), abs(kind(t.constant)) * kind(16 * float(jnp.finfo(dtype).eps))
-        slip = slip if rounding.outward() else kind(0)
-        lower, upper = constant - slip, constant + slip
+        constant, error = kind(t.constant), abs(kind(t.constant)) * kind(16 * float(jnp.finfo(dtype).eps))
+        error = error if rounding.outward() else kind(0)
+        lower, upper = constant - error, constant + error
         for k, value in t.coefficients.items():
             weight = kind(value)
             side = wide[k] if k < self.n else found[k - self.n]
@@ -183,9 +183,9 @@ class Expansion:
     ) -> _Bounded:
         if atom.source is not None:
             point = Interval.unchecked(u[atom.source], u[atom.source])
-            slip = wider(abs(u[atom.source]), self.terms)
+            error = wider(abs(u[atom.source]), self.terms)
             zero = [np.zeros((), states.center.dtype)] * self.n
-            return _Bounded(zero, point.lower, slip, Interval.unchecked(point.lower - slip, point.upper + slip))
+            return _Bounded(zero, point.lower, error, Interval.unchecked(point.lower - error, point.upper + error))
         curve, moving = _curve(atom), [t for t in atom.arguments if t.coefficients]
         if isinstance(curve, Wave) and self._plain(atom):
             return self._wave(curve, atom.arguments[0], states)
@@ -276,7 +276,7 @@ class Expansion:
         natural = self._argument_range(t, states.wide, [bounded.range for bounded in found])
         inner = {k - self.n: v for k, v in t.coefficients.items() if k >= self.n}
         slope: list[Any] = [np.zeros((), dtype)] * self.n
-        slip: Any = kind(0)
+        error: Any = kind(0)
         size: Any = kind(abs(float(t.constant)))
         for k, value in t.coefficients.items():
             weight = kind(abs(float(value)))
@@ -284,9 +284,9 @@ class Expansion:
             if k < self.n:
                 slope[k] = np.asarray(value, dtype)
                 inexact = value != Fraction(float(slope[k])) or len(t.coefficients) > 1 or inner
-                slip = slip + weight * states.slip[k] if inexact and rounding.outward() else slip
+                error = error + weight * states.error[k] if inexact and rounding.outward() else error
         center: Any = kind(t.constant)
-        radius: Any = slip + abs(center) * kind(16 * float(jnp.finfo(dtype).eps) * rounding.outward())
+        radius: Any = error + abs(center) * kind(16 * float(jnp.finfo(dtype).eps) * rounding.outward())
         for j, value in inner.items():
             weight = kind(value)
             for k, part in enumerate(found[j].slope):
@@ -431,8 +431,8 @@ class _Bounded:
 
 def _thin(x: Any, terms: int) -> Interval:
     """A point, widened for rows."""
-    slip = wider(abs(x), terms)
-    return Interval.unchecked(x - slip, x + slip)
+    error = wider(abs(x), terms)
+    return Interval.unchecked(x - error, x + error)
 
 
 def _values(found: list[Any], dtype: Any) -> tuple[Any, Any]:
@@ -444,8 +444,8 @@ def _values(found: list[Any], dtype: Any) -> tuple[Any, Any]:
         if isinstance(v, Interval):
             v = center_and_radius(v)
         pairs.append(v)
-    value, slip = (jnp.stack([jnp.asarray(pair[i], dtype) for pair in pairs]) for i in (0, 1))
-    return value, slip
+    value, error = (jnp.stack([jnp.asarray(pair[i], dtype) for pair in pairs]) for i in (0, 1))
+    return value, error
 
 
 def _nothing(n: int, states: States) -> _Bounded:
@@ -455,17 +455,17 @@ def _nothing(n: int, states: States) -> _Bounded:
 
 def _stacked(found: list[_Bounded], at: list[Any], states: States) -> AtomBounds:
     n, dtype = len(states.center), states.center.dtype
-    value, slip = _values(at, dtype) if len(at) == len(found) else (None, None)
+    value, error = _values(at, dtype) if len(at) == len(found) else (None, None)
     if not found:
         none = jnp.zeros(0, dtype)
-        return AtomBounds(jnp.zeros((0, n), dtype), none, none, Interval.unchecked(none, none), value, slip)
+        return AtomBounds(jnp.zeros((0, n), dtype), none, none, Interval.unchecked(none, none), value, error)
 
     def joined(parts: list[Any]) -> Any:
         return _joined(parts, dtype)
 
     natural = Interval.unchecked(joined([b.range.lower for b in found]), joined([b.range.upper for b in found]))
     slope, center, radius = ([getattr(b, name) for b in found] for name in ("slope", "center", "radius"))
-    return AtomBounds(joined([joined(part) for part in slope]), joined(center), joined(radius), natural, value, slip)
+    return AtomBounds(joined([joined(part) for part in slope]), joined(center), joined(radius), natural, value, error)
 
 
 def _joined(parts: list[Any], dtype: Any) -> Any:

@@ -25,7 +25,7 @@ class Promised(NamedTuple):
 
     applies: Any
     center: Any
-    slip: Any
+    center_error: Any
     radius: Any
     atoms: Any
 
@@ -44,7 +44,7 @@ def certified(
     # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
     c = jnp.where(applies, past.center, jnp.asarray(region.center, right.dtype))
     radius = jnp.where(applies, past.radius, 0)
-    promised = Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.slip))
+    promised = Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.value_error))
     gains, constants = observer.gains, observer.rounding_constants
     around = _around(maps, gains.residual[0], constants.growth, promised, known.right[0])
     around = plainly_wider(around, _first(left))
@@ -65,7 +65,7 @@ def _around(maps: Maps, weights: Any, slope: Any, promised: Promised, known: Int
 
     No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
     """
-    center, radius = at_point(maps.rows(weights), promised.center, promised.slip, *promised.atoms)
+    center, radius = at_point(maps.rows(weights), promised.center, promised.center_error, *promised.atoms)
     radius = radius + matmul(jnp.asarray(slope, radius.dtype), promised.radius)
     radius = radius + wider(abs(center) + radius, 0)
     return Interval.unchecked(center - radius + known.lower, center + radius + known.upper)

@@ -33,7 +33,7 @@ class Affine(NamedTuple):
 def affine_rows(rows: Rows, states: States, atoms: AtomBounds) -> Affine:
     """Linear combinations of atoms as affine bounds; the radius holds what the slope is off by."""
     center = matmul(rows.atoms, atoms.center) + rows.constant
-    radius = scale(abs(rows.atoms), atoms.radius).sum(-1) + scale(abs(rows.states), states.slip).sum(-1)
+    radius = scale(abs(rows.atoms), atoms.radius).sum(-1) + scale(abs(rows.states), states.error).sum(-1)
     return Affine(rows.slope(atoms), center, radius + of_constant(rows.constant))
 
 
@@ -166,13 +166,13 @@ def centred_form(
     """
     middle, radius = _center_and_wider_radius(right, terms)
     before = clip(middle, within)
-    center, slip = remainder(before)
+    center, error = remainder(before)
     c = clip(middle - matmul(N_z, center), within)
-    slip = matmul(abs(N_z), slip) + wider(abs(middle) + matmul(abs(N_z), abs(center)), terms)
+    error = matmul(abs(N_z), error) + wider(abs(middle) + matmul(abs(N_z), abs(center)), terms)
     move = abs(c - before)
     if left is not None and rounding.outward():
-        slip = slip + rounding.generous(matmul(left, abs(c)))
-    far = radius + slip + move
+        error = error + rounding.generous(matmul(left, abs(c)))
+    far = radius + error + move
     away = scale(inverse, far).sum(-1)
     away = away - move + wider(abs(c) + away + far, terms)
     return Interval.unchecked(c - away, c + away)

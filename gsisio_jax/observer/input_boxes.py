@@ -32,7 +32,7 @@ def from_inverses(maps: Maps, domain: Domain, states: States, fixed: Interval, p
     loose = scale(abs(slope), states.radius).sum(-1) + scale(abs(inverses.remainder), psi.radius).sum(-1)
     # What rounding the slope has lost, where it was combined.
     combined = jnp.where((inverses.remainder != 0).any(-1, keepdims=True), abs(inverses.state), 0)
-    loose = loose + scale(combined, states.slip).sum(-1)
+    loose = loose + scale(combined, states.error).sum(-1)
     now = Interval.unchecked(fixed.lower + (middle - loose), fixed.upper + (middle + loose))
     d = Domain.of(limits, 0.0).intersect(now, Source.INPUT)
     return d.box, domain.taken(d)

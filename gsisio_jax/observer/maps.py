@@ -83,8 +83,8 @@ class Maps:
             return self.expansion.bounds(states, u, with_values=promised)
         form = bound(observer.system.maps, observer.bounds, observer.abstraction)(box, u)
         found = widened_atoms(form.slope, form.offset, form.range, states, self.terms)
-        value, slip = self._at(observer.system.maps, states.center, u) if promised else (None, None)
-        return replace(found, value=value, slip=slip)
+        value, error = self._at(observer.system.maps, states.center, u) if promised else (None, None)
+        return replace(found, value=value, value_error=error)
 
     def free_bounds(self, states: States, box: Interval, u: Any) -> AtomBounds:
         """Atoms of T2 g on a box."""
@@ -142,8 +142,8 @@ class Maps:
         return self.observer.T2 @ self.observer.system.measurement(x, u)
 
 
-def at_point(rows: Rows, x: Any, slip: Any, value: Any, value_slip: Any) -> tuple[Any, Any]:
+def at_point(rows: Rows, x: Any, x_error: Any, value: Any, value_error: Any) -> tuple[Any, Any]:
     """Center and radius (r,) of a linear combination at a point x, from values of the atoms there."""
     center = matmul(rows.states, x) + matmul(rows.atoms, value) + rows.constant
-    radius = matmul(abs(rows.states), slip) + scale(abs(rows.atoms), value_slip).sum(-1)
+    radius = matmul(abs(rows.states), x_error) + scale(abs(rows.atoms), value_error).sum(-1)
     return center, radius + of_constant(rows.constant)
