@@ -29,9 +29,9 @@ from gsisio_jax.inclusion.node import (
     is_node,
     jac_of,
     join,
+    normalise,
+    normalised,
     parts,
-    settle,
-    settled,
     slope_of,
 )
 from gsisio_jax.inclusion.rules import comparison, linear
@@ -73,7 +73,7 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
         return _call(eqn, *args) if CALLS.get(name) is _call else _constant(eqn, args)
     by_hand = _BY_HAND.get(name) or _BY_HAND.get(eqn.params.get("name"))
     if by_hand is not None:
-        value = settle(_apply_by_hand(by_hand, [settled(arg) for arg in args]))
+        value = normalise(_apply_by_hand(by_hand, [normalised(arg) for arg in args]))
         return [value] if eqn.primitive.multiple_results else value
     if name in CALLS:
         return CALLS[name](eqn, *args)
@@ -82,7 +82,7 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
     if name in REDUCTIONS or name in ELEMENTWISE:
         aligned = args if name in REDUCTIONS else _aligned(args, eqn.outvars[0].aval.shape)
         value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
-        return settle(value) if is_node(value) and not value.unnormalised else value
+        return normalise(value) if is_node(value) and not value.unnormalised else value
     raise UnknownPrimitiveError(name)
 
 
@@ -94,7 +94,7 @@ def _constant(eqn: Any, args: Sequence[Any]) -> Any:
     if rounds and not all(map(is_known, args)):
         nodes = [as_node(arg, jnp.shape(arg), out.dtype) for arg in args]
         aligned = nodes if name in REDUCTIONS else _aligned(nodes, out.shape)
-        return settle((REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned))
+        return normalise((REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned))
     return fold(lambda *a: eqn.primitive.bind(*(jnp.asarray(v) for v in a), **eqn.params), *args)
 
 
@@ -123,7 +123,7 @@ def _call(eqn: Any, *args: Any) -> Any:
         raise UnknownPrimitiveError(eqn.primitive.name, "without a body") from None
     name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
     if name in LIBRARY and source.startswith(_JAX) and any(is_node(arg) for arg in args):
-        return [settle(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
+        return [normalise(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
     return evaluate(jaxpr, consts, args)
 
 
@@ -180,7 +180,7 @@ def _loop(turn: Callable[..., Any], carry: list[Any], xs: Sequence[Any], length:
         """Entries of the scanned axis first, also in slopes and Jacobians."""
         if not is_node(x):
             return x
-        x = settled(x)
+        x = normalised(x)
         form = _form(x)
         form = None if form is None else (jnp.swapaxes(form.slope, 0, 1), form.folded())
         return x.range, form, jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), x.jac)
@@ -215,7 +215,7 @@ def _bare(value: Any) -> Any:
     """A node without the box, which is the same in every turn."""
     if not is_node(value):
         return value
-    value = settled(value)
+    value = normalised(value)
     form = _form(value)
     return value.range, None if form is None else (form.slope, form.folded()), value.jac
 

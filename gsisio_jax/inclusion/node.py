@@ -27,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import (
+    box_sum,
     finite_numbers,
     guard,
     is_exact,
@@ -36,7 +37,6 @@ from gsisio_jax.inclusion.form_arithmetic import (
     known_times,
     loosened,
     product,
-    shift,
     slope_products,
     slope_reach,
     spare,
@@ -157,7 +157,7 @@ class Node(eqx.Module):
     of its form, which is computed when it is asked for.
 
     Sums hand a NaN on, so it need not be looked for after each of them: `unnormalised` nodes may hold one where they
-    overflowed, until `settle` turns it into "no bound". Every rule that compares its arguments settles them first.
+    overflowed, until `normalise` turns it into "no bound". Every rule that compares its arguments does that first.
     """
 
     given: Interval | None
@@ -228,17 +228,17 @@ def best_form(slope: Any, offset: Interval, natural: Interval, box: InputBox, sl
     return Form(fusion_barrier(jnp.where(good, slope, 0)), computed_once(choose(good, offset, natural)), box, slack)
 
 
-def unsettled(given: Interval | None, form: Form | None, jac: Interval | None) -> Node:
-    """A node that a linear rule made; to nearest it is settled at once."""
+def unnormalised_node(given: Interval | None, form: Form | None, jac: Interval | None) -> Node:
+    """A node that a linear rule made; to nearest it is normalised at once."""
     return Node(given, form, jac, rounding.outward())
 
 
-def settled(value: Any) -> Any:
-    """`settle` where that has not been done."""
-    return settle(value) if is_node(value) and value.unnormalised else value
+def normalised(value: Any) -> Any:
+    """`normalise` where that has not been done."""
+    return normalise(value) if is_node(value) and value.unnormalised else value
 
 
-def settle(node: Node) -> Node:
+def normalise(node: Node) -> Node:
     """Last word on the result of every arithmetic rule, in all three domains: what overflowed is unbounded."""
     if not jnp.issubdtype(node.dtype, jnp.floating):
         return node
@@ -316,4 +316,4 @@ def join(a: Interval | None, b: Interval | None) -> Interval | None:
     """Sum of two Jacobians, absent ones being zero."""
     if a is None or b is None:
         return b if a is None else a
-    return sparse(shift(a, b), a, b)
+    return sparse(box_sum(a, b), a, b)

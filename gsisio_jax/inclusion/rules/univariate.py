@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import guard, scaled_slack, slope_reach
-from gsisio_jax.inclusion.node import POINT_MODE, Node, best_form, chain, settled
+from gsisio_jax.inclusion.node import POINT_MODE, Node, best_form, chain, normalised
 from gsisio_jax.inclusion.rules.sincos import LIMIT
 from gsisio_jax.inclusion.rules.trig import Wave, crosses
 from gsisio_jax.interval import rounding
@@ -47,7 +47,7 @@ _PLAIN = (-1.0, 0.0, 0.25, 1.0, 2.0)  # limits of functions that are numbers of 
 
 def apply(curve: Any, x: Node) -> Node:
     """Apply a function of one variable to a node, in all domains."""
-    x = settled(x)
+    x = normalised(x)
     a, b = x.range.lower, x.range.upper
     if getattr(curve, "steep", False):
         a, b = _calm(a), _calm(b)
