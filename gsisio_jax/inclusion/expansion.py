@@ -11,7 +11,7 @@ Rounding: see `atoms`.
 
 **Atoms of atoms.** An argument t is such a row, too: ``t = s_t x + c_t +- r_t`` with the magnitude
 ``T = sum |w_i| m_i + sum |w_j| q_j + |c|``, and its bounds are off by ``kappa T`` at most. A curve with the line
-``|phi(t) - s t - middle| <= half`` on the range of t (`univariate.Line`), ``|phi| <= size``, has the slope
+``|phi(t) - s t - middle| <= half`` on the range of t (`lines.Line`), ``|phi| <= size``, has the slope
 ``s s_t``, the center ``s c_t + middle`` and the radius ``|s| r_t + half``, and its q is below ``3 |s| T + size``: one
 ``kappa |s| T`` for the argument and one kappa q for the rows. So radii are widened by ``(ulps + 4 kappa) (size + |s|
 T)``, with ulps for the line. What is flushed to zero in t counts |s| times: T is made ``tiny / eps`` larger, which is
@@ -34,11 +34,12 @@ from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, widened_atoms, 
 from gsisio_jax.inclusion.linear_parts import Atom, Linear
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node
 from gsisio_jax.inclusion.rules.bilinear import bilinear_line, multiply
-from gsisio_jax.inclusion.rules.functions import CURVES, LINES, RECIPROCAL, SQUARE, UNBOUNDED, power
+from gsisio_jax.inclusion.rules.functions import CURVES, RECIPROCAL, SQUARE, power
+from gsisio_jax.inclusion.rules.lines import LINES, UNBOUNDED, Line, line_of
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE
 from gsisio_jax.inclusion.rules.sincos import LIMIT
 from gsisio_jax.inclusion.rules.trig import Wave, wave_atom, wave_point
-from gsisio_jax.inclusion.rules.univariate import Line, apply, line_of
+from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, center_and_radius, choose, faint, is_concrete, nan_to_unbounded
 from gsisio_jax.interval.minmax import cut, raised
