@@ -158,7 +158,7 @@ def slope_image(slope: Any, box: Any) -> Interval:
     return Interval.unchecked(rounding.sum_down(low, 0), rounding.sum_up(high, 0))
 
 
-def slope_reach(slope: Any, box: Any) -> Any:
+def slope_magnitude(slope: Any, box: Any) -> Any:
     """``sum |slope| magnitude``, to nearest; ``0 * inf = 0``."""
     far = jnp.reshape(box.magnitude, (-1,) + (1,) * (slope.ndim - 1))
     size = abs(slope)

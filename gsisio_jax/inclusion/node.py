@@ -37,8 +37,8 @@ from gsisio_jax.inclusion.form_arithmetic import (
     known_times,
     loosened,
     product,
+    slope_magnitude,
     slope_products,
-    slope_reach,
     spare,
 )
 from gsisio_jax.interval import rounding
@@ -79,7 +79,7 @@ class Form(eqx.Module):
         """The offset that belongs to the slope alone."""
         if self.slack is None:
             return self.offset
-        return loosened(self.offset, slope_reach(self.slack, self.box), self.slope.shape[0] + 4.0)
+        return loosened(self.offset, slope_magnitude(self.slack, self.box), self.slope.shape[0] + 4.0)
 
     def image(self) -> Interval:
         """Bounds of the value that follow from the form alone."""
@@ -91,7 +91,7 @@ class Form(eqx.Module):
             return Interval.unchecked(lower, upper)
         n = low.shape[0] + 6.0
         # The slack counts whole; its own rounding is far below what it was taken too large by.
-        loss = 0 if self.slack is None else slope_reach(self.slack, self.box)
+        loss = 0 if self.slack is None else slope_magnitude(self.slack, self.box)
         lower = lower - (loss + rounding.error(add_up(abs(low), 0) + abs(self.offset.lower) + loss, n, n))
         upper = upper + (loss + rounding.error(add_up(abs(high), 0) + abs(self.offset.upper) + loss, n, n))
         return Interval.unchecked(lower, upper)
@@ -143,7 +143,7 @@ class Form(eqx.Module):
         share, floor = (np.where(exact, 0, value).astype(slope.dtype) for value in (n * info.eps, n * info.tiny))
         if self.slack is not None and self.slack.any():
             low_size, high_size = (
-                size + slope_reach(self.slack / share.max(), self.box) for size in (low_size, high_size)
+                size + slope_magnitude(self.slack / share.max(), self.box) for size in (low_size, high_size)
             )
         radius = jax.lax.stop_gradient(spare(exact, low_size * share) + floor)
         other = radius if same else jax.lax.stop_gradient(spare(exact, high_size * share) + floor)

@@ -29,7 +29,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax.inclusion.form_arithmetic import guard, scaled_slack, slope_reach
+from gsisio_jax.inclusion.form_arithmetic import guard, scaled_slack, slope_magnitude
 from gsisio_jax.inclusion.node import POINT_MODE, Node, best_form, chain, normalised
 from gsisio_jax.inclusion.rules.trig import Wave
 from gsisio_jax.interval import rounding
@@ -66,7 +66,7 @@ def apply(curve: Any, x: Node) -> Node:
             lower = rounding.lowered(lower, abs(first) + abs(lower), 2.0)
             upper = rounding.raised(upper, abs(last) + abs(upper), 2.0)
             slack = scaled_slack(s, x.form.slope, slope, x.form.slack)
-            size = slope_reach(slope, x.form.box)
+            size = slope_magnitude(slope, x.form.box)
         form = best_form(slope, computed_once(Interval.unchecked(lower, upper)), natural, x.form.box, slack, size)
     return Node(natural, form, None if x.jac is None else chain(guard(curve.derivative(a, b, *shared)), x.jac))
 
