@@ -12,7 +12,8 @@ from hypothesis.extra import numpy as hnp
 
 from gsisio_jax import Interval, hull, intersect, linear_image
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import cast_down, cast_up, scale
+from gsisio_jax.interval.cast import cast_down, cast_up
+from gsisio_jax.interval.primitives import scale
 
 FINITE = st.floats(-1e6, 1e6, allow_nan=False, width=32)
 

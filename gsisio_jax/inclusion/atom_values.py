@@ -17,7 +17,8 @@ from gsisio_jax.inclusion.rules.registry import ELEMENTWISE
 from gsisio_jax.inclusion.rules.trig import Wave, wave_point
 from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, center_and_radius, faint, nan_to_unbounded
+from gsisio_jax.interval.box import Interval, center_and_radius, nan_to_unbounded
+from gsisio_jax.interval.image import faint
 
 
 def atom_value(atom: Atom, x: Any, thin: Interval, u: Any, found: Sequence[Any], terms: int) -> Any:

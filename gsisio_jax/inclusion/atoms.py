@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, center_and_radius, faint, plain_sums
+from gsisio_jax.interval.box import Interval, center_and_radius
+from gsisio_jax.interval.image import faint, plain_sums
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
 

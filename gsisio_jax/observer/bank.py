@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from gsisio_jax.interval.box import Interval, plain_image, widened_for_sums
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.image import plain_image, widened_for_sums
 
 
 class LinearBounds(eqx.Module):

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax.inclusion.atoms import States, wider
-from gsisio_jax.interval.box import Interval, choose, intersect, plain_image
+from gsisio_jax.interval.box import Interval, choose, intersect
+from gsisio_jax.interval.image import plain_image
 from gsisio_jax.interval.primitives import matmul
 from gsisio_jax.observer.bank import Known
 from gsisio_jax.observer.contractors import centred_form

@@ -10,17 +10,8 @@ import jax.numpy as jnp
 from gsisio_jax.inclusion.atoms import wider
 from gsisio_jax.inclusion.transforms import affine_with_slack
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import (
-    Interval,
-    choose,
-    entire_like,
-    image,
-    loose_matvec_upper,
-    magnitude,
-    matvec_upper,
-    plain_image,
-    widened_for_sums,
-)
+from gsisio_jax.interval.box import Interval, choose, entire_like, magnitude
+from gsisio_jax.interval.image import image, loose_matvec_upper, matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.observer.contractors import Affine, centred_form
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.maps import Maps, at_point

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.atoms import States
-from gsisio_jax.interval.box import Interval, is_concrete, plain_image, widened_for_sums
+from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.interval.image import plain_image, widened_for_sums
 from gsisio_jax.interval.minmax import smaller
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.bank import Terms

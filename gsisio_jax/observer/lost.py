@@ -7,7 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, loose_matvec_upper, magnitude
+from gsisio_jax.interval.box import Interval, magnitude
+from gsisio_jax.interval.image import loose_matvec_upper
 from gsisio_jax.interval.minmax import cut
 from gsisio_jax.observer.bank import CancellationResidual
 from gsisio_jax.observer.types import Observer

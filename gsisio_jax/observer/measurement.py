@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from gsisio_jax import inclusion
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, add, choose, entire_like, image
+from gsisio_jax.interval.box import Interval, add, choose, entire_like
+from gsisio_jax.interval.image import image
 from gsisio_jax.plant.system import System
 
 

@@ -17,19 +17,9 @@ from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.intersection import bound
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import (
-    Interval,
-    add,
-    choose,
-    image,
-    intersect,
-    loose_matvec_upper,
-    magnitude,
-    nan_to_unbounded,
-    scale,
-    widen,
-)
-from gsisio_jax.interval.primitives import multiplied
+from gsisio_jax.interval.box import Interval, add, choose, intersect, magnitude, nan_to_unbounded, widen
+from gsisio_jax.interval.image import image, loose_matvec_upper
+from gsisio_jax.interval.primitives import multiplied, scale
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.domain import Domain, largest_magnitude

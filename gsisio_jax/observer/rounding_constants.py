@@ -20,7 +20,8 @@ import numpy as np
 from gsisio_jax import inclusion
 from gsisio_jax.inclusion.transforms import AffineForm, affine_with_slack
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, cast_down, cast_up
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.cast import cast_down, cast_up
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.residuals import (
     cancellation_residual,

@@ -13,16 +13,8 @@ import jax.numpy as jnp
 
 from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import (
-    Interval,
-    add,
-    choose,
-    entire_like,
-    image,
-    nan_to_unbounded,
-    plain_image,
-    widened_for_sums,
-)
+from gsisio_jax.interval.box import Interval, add, choose, entire_like, nan_to_unbounded
+from gsisio_jax.interval.image import image, plain_image, widened_for_sums
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
