@@ -105,6 +105,15 @@ def test_intersection_reports_its_slack_and_never_crosses():
     assert hull(a, b).upper.tolist() == [4.0, 9.0, 4.0]
 
 
+def test_intersection_passes_over_a_side_that_overflowed():
+    nan = np.nan  # the third box misses a with the side that is left
+    a = Interval([0.0, 0.0, 0.0], [4.0, 4.0, 4.0])
+    b = Interval.unchecked(np.array([nan, 1.0, nan]), np.array([2.0, nan, -1.0]))
+    met, _ = intersect(a, b)
+    assert met.lower.tolist() == [0.0, 1.0, 0.0]
+    assert met.upper.tolist() == [2.0, 4.0, 4.0]
+
+
 @settings(max_examples=100, deadline=None)
 @given(hnp.arrays(np.float64, 4, elements=st.floats(allow_nan=False)))
 def test_narrowing_casts_round_outward(values):

@@ -202,7 +202,7 @@ def _add_down(values: list[Any]) -> Any:
 
 
 def computed_once(box: Interval) -> Interval:
-    """The box itself, whose bounds are computed once however often they are used; see `once`."""
+    """The box itself, whose bounds are computed once however often they are used; see `fusion_barrier`."""
     return Interval.unchecked(fusion_barrier(box.lower), fusion_barrier(box.upper))
 
 

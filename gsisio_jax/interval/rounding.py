@@ -160,7 +160,7 @@ def generous(radius: Any) -> Any:
     Relative errors of such numbers add up: with fewer than ``2^12`` operations on the way to any of them they stay
     below ``2^-10`` (float32: ``2^12 2^-23``; float64 has room to spare). A product that is flushed to zero loses tiny,
     and fewer than ``2^60`` are added; where a radius is multiplied once more, what it lost before has been added to it
-    already (here, or in `contractors._reached`). For radii that stand for rounding themselves, where a share of a
+    already, here. For radii that stand for rounding themselves, where a share of a
     thousandth is nothing.
     """
     kind = np.dtype(radius.dtype).type
