@@ -13,8 +13,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-# As the command line of the library sets them, unless the user has; before JAX is imported.
-XLA_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
 RESULTS = Path(__file__).resolve().parent / "results"
 SIZES = {  # full, quick
     "compiled": ({"batch": 100_000, "steps": 100}, {"batch": 5_000, "steps": 50}),
@@ -84,7 +82,11 @@ def run_apart(name: str, quick: bool, against: str | None = None) -> dict[str, A
     print(f"{name} ...", file=sys.stderr, flush=True)
     command = [sys.executable, "-m", "benchmarks", "--case", name, *(["--quick"] if quick else [])]
     command += ["--against", against] if against else []
-    environment = {"XLA_FLAGS": XLA_FLAGS, **os.environ, "JAX_ENABLE_X64": "1"}
+    from gsisio_jax.scalar import options  # here: a case may measure what importing takes
+
+    # As the command line of the library sets them, unless the user has; before JAX starts.
+    flags = os.environ.get("XLA_FLAGS", options.extended(""))
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
     done = subprocess.run(command, capture_output=True, text=True, cwd=RESULTS.parent.parent, env=environment)
     if done.returncode:
         print(done.stderr, file=sys.stderr)

@@ -19,8 +19,6 @@ import numpy as np
 import gsisio_jax as gx
 from benchmarks.plants import from_tests
 from gsisio_jax.observer import step
-from gsisio_jax.observer.fixed import Fixed
-from gsisio_jax.scalar import ScalarProgram, scalar_program
 
 RUNS, SETTLED = 40, 10
 
@@ -76,16 +74,10 @@ def measured(observer: gx.Observer, plant: Any) -> str:
     run, _ = jax.jit(jax.vmap(plant.simulate))(jax.random.split(jax.random.key(0), RUNS))
     u = jnp.asarray(plant.u(plant.steps)) if plant.system.m else None
     estimate = jax.jit(jax.vmap(lambda y: gx.estimate(observer, plant.initial, y, u)))(run.y)
-    count = sum(_program(observer, plant).count().values())
+    sizes = from_tests("sizes")
+    count = sum(sizes.step_program(observer, sizes.first_arguments(observer, plant)).count().values())
     x, d = (np.asarray(box.width)[:, SETTLED:].mean((0, 1)) for box in (estimate.state, estimate.input))
     return f"{count:>8,}  x {_row(x)}  d {_row(d)}"
-
-
-def _program(observer: gx.Observer, plant: Any) -> ScalarProgram:
-    """One step over single numbers."""
-    constant, box = Fixed(observer).value, jax.tree.map(jnp.asarray, plant.initial)
-    args = step.blank(constant, box), jnp.zeros(plant.system.l), jnp.asarray(plant.u(1)[0]), plant.noise
-    return scalar_program(jax.make_jaxpr(lambda *a: step.advance(constant, *a))(*jax.tree.map(jnp.asarray, args)))
 
 
 def _row(values: np.ndarray) -> str:

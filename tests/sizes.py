@@ -33,15 +33,12 @@ class Step:
 
     def __init__(self, name: str):
         case = replace(getattr(systems, name)(), sweeps=3)
-        self._observer, u = case.design(missing=False), jnp.asarray(case.u(1)[0])
-        box, noise = (jax.tree.map(jnp.asarray, x) for x in (case.initial, case.noise))
-        self._args = blank(self._observer, box), jnp.zeros(case.system.l), u, noise
+        self._observer = case.design(missing=False)
+        self._args = first_arguments(self._observer, case)
 
     def program(self, variant: str) -> ScalarProgram:
         """The step over single numbers; "with gradient" is "outward"."""
-        observer = self._observer.with_rounding("nearest" if variant == "nearest" else "outward")
-        fixed = Fixed(observer).value
-        return scalar_program(jax.make_jaxpr(lambda *args: advance(fixed, *args))(*self._args))
+        return step_program(self._observer.with_rounding("nearest" if variant == "nearest" else "outward"), self._args)
 
     def operations(self, variant: str) -> Counter[str]:
         """Scalar operations of every stage."""
@@ -63,6 +60,18 @@ class Step:
         else:
             closed = jax.make_jaxpr(program)(_entries(self._args))
         return _equations(closed.jaxpr, "")
+
+
+def first_arguments(observer: Any, case: systems.Case) -> tuple[Any, Any, Any, Any]:
+    """What a first step of a test system takes: carry, y, u, noise."""
+    box, noise = (jax.tree.map(jnp.asarray, x) for x in (case.initial, case.noise))
+    return blank(observer, box), jnp.zeros(case.system.l), jnp.asarray(case.u(1)[0]), noise
+
+
+def step_program(observer: Any, args: Any) -> ScalarProgram:
+    """One step over single numbers, its gain a constant."""
+    fixed = Fixed(observer).value
+    return scalar_program(jax.make_jaxpr(lambda *args: advance(fixed, *args))(*args))
 
 
 def counts() -> Budget:

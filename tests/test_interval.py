@@ -12,7 +12,8 @@ from hypothesis.extra import numpy as hnp
 
 from gsisio_jax import Interval, hull, intersect, linear_image
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import cast_down, cast_up, scale
+from gsisio_jax.interval.cast import cast_down, cast_up
+from gsisio_jax.interval.primitives import scale
 
 FINITE = st.floats(-1e6, 1e6, allow_nan=False, width=32)
 
@@ -102,6 +103,15 @@ def test_intersection_reports_its_slack_and_never_crosses():
     assert met.lower.tolist() == [1.0, 0.5, 0.0]
     assert met.upper.tolist() == [2.0, 1.0, 1.0]
     assert hull(a, b).upper.tolist() == [4.0, 9.0, 4.0]
+
+
+def test_intersection_passes_over_a_side_that_overflowed():
+    nan = np.nan  # the third box misses a with the side that is left
+    a = Interval([0.0, 0.0, 0.0], [4.0, 4.0, 4.0])
+    b = Interval.unchecked(np.array([nan, 1.0, nan]), np.array([2.0, nan, -1.0]))
+    met, _ = intersect(a, b)
+    assert met.lower.tolist() == [0.0, 1.0, 0.0]
+    assert met.upper.tolist() == [2.0, 4.0, 4.0]
 
 
 @settings(max_examples=100, deadline=None)

@@ -20,15 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, faint
+from gsisio_jax.interval.box import Interval, center_and_radius
+from gsisio_jax.interval.image import faint, plain_sums
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
 
-FLUSHED = 2.0**60  # in smallest normal numbers
-
 
 class States(eqx.Module):
-    """The box of x as atoms and rows use it: center, radius, `slip` = kappa m, and both sides widened by it.
+    """The box of x as atoms and rows use it: center, radius, `error` = kappa m, and both sides widened by it.
 
     Every field has shape (n,); a radius may be infinite, a center never is.
     """
@@ -36,17 +35,16 @@ class States(eqx.Module):
     center: Any
     radius: Any
     magnitude: Any
-    slip: Any
+    error: Any
     wide: Interval
 
     @classmethod
     def of(cls, box: Interval, terms: int) -> States:
         box = Interval.unchecked(jnp.asarray(box.lower), jnp.asarray(box.upper))
-        radius = 0.5 * (box.upper - box.lower)
-        center = jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0)
+        center, radius = center_and_radius(box)
         magnitude = abs(center) + radius
-        slip = wider(magnitude, terms)
-        return cls(center, radius + slip, magnitude, slip, Interval.unchecked(box.lower - slip, box.upper + slip))
+        error = wider(magnitude, terms)
+        return cls(center, radius + error, magnitude, error, Interval.unchecked(box.lower - error, box.upper + error))
 
 
 class AtomBounds(eqx.Module):
@@ -56,7 +54,7 @@ class AtomBounds(eqx.Module):
         slope: (J, n).
         center, radius: (J,) of the offset: ``|a - slope x - center| <= radius``.
         range: box (J,).
-        value, slip: (J,) the atoms at the center of the box, and what rounding leaves of them; None if not asked for.
+        value, value_error: (J,) the atoms at the center of the box, and their rounding error; None if not asked for.
     """
 
     slope: Any
@@ -64,7 +62,7 @@ class AtomBounds(eqx.Module):
     radius: Any
     range: Interval
     value: Any = None
-    slip: Any = None
+    value_error: Any = None
 
 
 def wider(size: Any, terms: int) -> Any:
@@ -73,7 +71,7 @@ def wider(size: Any, terms: int) -> Any:
         return jnp.zeros_like(size)
     info = jnp.finfo(size.dtype)
     kind = np.dtype(size.dtype).type
-    kappa, floor = kind((2 * terms + 16) * float(info.eps)), kind(FLUSHED * float(info.tiny))
+    kappa, floor = kind((2 * terms + 16) * float(info.eps)), kind(rounding.FLUSHED * float(info.tiny))
     return jax.lax.stop_gradient(size) * kappa + floor
 
 
@@ -100,18 +98,18 @@ class Rows(eqx.Module):
         slope = self.slope(atoms)
         center = matmul(slope, states.center) + matmul(self.atoms, atoms.center) + self.constant
         radius = scale(abs(slope), states.radius).sum(-1) + scale(abs(self.atoms), atoms.radius).sum(-1)
-        return center, radius + self.slip(states, atoms)
+        return center, radius + self.rounding_error(states, atoms)
 
-    def slip(self, states: States, atoms: AtomBounds) -> Any:
+    def rounding_error(self, states: States, atoms: AtomBounds) -> Any:
         """What the slopes of the states, the constant, and weights that were rounded are off by, (r,)."""
-        slip = scale(abs(self.states), states.slip).sum(-1) + of_constant(self.constant) + self._faint()
+        error = scale(abs(self.states), states.error).sum(-1) + of_constant(self.constant) + self._faint()
         if self.lost is None or not rounding.outward():
-            return slip
+            return error
         far = jnp.maximum(abs(atoms.range.lower), abs(atoms.range.upper))
         size = scale(abs(atoms.slope), states.magnitude).sum(-1) + abs(atoms.center) + atoms.radius
         size = jnp.maximum(size, jnp.where(jnp.isfinite(far), far, 0))
         of_states, of_atoms = self.lost
-        return slip + wider(
+        return error + wider(
             scale(of_states, states.magnitude).sum(-1) + scale(of_atoms, size).sum(-1), self.atoms.shape[-1]
         )
 
@@ -132,9 +130,9 @@ class Rows(eqx.Module):
         weights = jnp.concatenate([jnp.asarray(self.states), jnp.asarray(self.atoms)], -1)
         lower = jnp.concatenate([states.wide.lower, atoms.range.lower])
         upper = jnp.concatenate([states.wide.upper, atoms.range.upper])
-        low, high = _sides(weights, lower, upper)
-        slip = of_constant(self.constant) + self._faint() if self.lost is None else self.slip(states, atoms)
-        return Interval.unchecked(low + (self.constant - slip), high + (self.constant + slip))
+        low, high = plain_sums(weights, Interval.unchecked(lower, upper))
+        error = of_constant(self.constant) + self._faint() if self.lost is None else self.rounding_error(states, atoms)
+        return Interval.unchecked(low + (self.constant - error), high + (self.constant + error))
 
     def bounds(self, states: States, atoms: AtomBounds) -> Interval:
         """The intersection of both, box (r,)."""
@@ -142,20 +140,13 @@ class Rows(eqx.Module):
         return Interval.unchecked(raised(natural.lower, joint.lower), cut(natural.upper, joint.upper))
 
 
-def _sides(weights: Any, lower: Any, upper: Any) -> tuple[Any, Any]:
-    """Both sides of the image of a box that has been widened beforehand."""
-    up = weights >= 0
-    low = scale(weights, jnp.where(up, lower, upper)).sum(-1)
-    return low, scale(weights, jnp.where(up, upper, lower)).sum(-1)
-
-
-def widened(slope: Any, offset: Interval, natural: Interval, states: States, terms: int) -> AtomBounds:
+def widened_atoms(slope: Any, offset: Interval, natural: Interval, states: States, terms: int) -> AtomBounds:
     """Bounds of any functions as atoms: affine forms (J, n), (J,) and ranges, each valid by itself."""
     center, radius = offset.center, offset.radius
     size = scale(abs(slope), states.magnitude).sum(-1) + abs(center) + radius
     far = jnp.maximum(abs(natural.lower), abs(natural.upper))
-    slip = wider(jnp.where(jnp.isfinite(far), far, 0), terms)
+    error = wider(jnp.where(jnp.isfinite(far), far, 0), terms)
     # The radius of an interval is itself rounded.
     radius = radius + wider(jnp.where(jnp.isfinite(size), size, 0), terms)
     radius = jnp.where(jnp.isfinite(size), radius, jnp.inf)
-    return AtomBounds(slope, center, radius, Interval.unchecked(natural.lower - slip, natural.upper + slip))
+    return AtomBounds(slope, center, radius, Interval.unchecked(natural.lower - error, natural.upper + error))

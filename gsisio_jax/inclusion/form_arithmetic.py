@@ -50,7 +50,7 @@ def is_zero(a: Interval) -> bool:
     return is_known(a.lower) and is_known(a.upper) and not (a.lower.any() or a.upper.any())
 
 
-def shift(a: Interval, b: Interval) -> Interval:
+def box_sum(a: Interval, b: Interval) -> Interval:
     """Sum of two boxes."""
     if np.shape(a.lower) == np.shape(b.lower) and (is_zero(a) or is_zero(b)):
         return a if is_zero(b) else b
@@ -64,10 +64,10 @@ def shift(a: Interval, b: Interval) -> Interval:
     return Interval.unchecked(rounding.down(lower), rounding.up(upper))
 
 
-def stretch(factor: Any, a: Interval, ulps: float = 2.0) -> Interval:
+def scaled(factor: Any, a: Interval, ulps: float = 2.0) -> Interval:
     """Product of a number and a box; with more `ulps` for a factor that was itself rounded."""
     if is_known(factor) and np.isfinite(factor).all():
-        return _stretch_known(factor, a, ulps)
+        return _scaled_by_known(factor, a, ulps)
     if is_point(a):
         value = times(factor, a.lower)
         return Interval.unchecked(rounding.down(value, ulps), rounding.up(value, ulps))
@@ -76,8 +76,8 @@ def stretch(factor: Any, a: Interval, ulps: float = 2.0) -> Interval:
     return Interval.unchecked(rounding.down(lower, ulps), rounding.up(upper, ulps))
 
 
-def _stretch_known(factor: Any, a: Interval, ulps: float) -> Interval:
-    """`stretch` by numbers whose signs are known: no test for ``0 * inf`` where none of them is 0."""
+def _scaled_by_known(factor: Any, a: Interval, ulps: float) -> Interval:
+    """`scaled` by numbers whose signs are known: no test for ``0 * inf`` where none of them is 0."""
     if is_known(a.lower) and is_known(a.upper) and ulps == 2.0:
         return _known_multiple(factor, a)
 
@@ -148,7 +148,7 @@ def slope_products(slope: Any, box: Any) -> tuple[Any, Any]:
     side = (-1,) + (1,) * (slope.ndim - 1)
     lower, upper = jnp.reshape(box.lower, side), jnp.reshape(box.upper, side)
     with rounding.using("nearest"):
-        image = stretch(slope, Interval.unchecked(lower, upper))
+        image = scaled(slope, Interval.unchecked(lower, upper))
     return image.lower, image.upper
 
 
@@ -158,9 +158,9 @@ def slope_image(slope: Any, box: Any) -> Interval:
     return Interval.unchecked(rounding.sum_down(low, 0), rounding.sum_up(high, 0))
 
 
-def slope_reach(slope: Any, box: Any) -> Any:
-    """``sum |slope| reach``, to nearest; ``0 * inf = 0``."""
-    far = jnp.reshape(box.reach, (-1,) + (1,) * (slope.ndim - 1))
+def slope_magnitude(slope: Any, box: Any) -> Any:
+    """``sum |slope| magnitude``, to nearest; ``0 * inf = 0``."""
+    far = jnp.reshape(box.magnitude, (-1,) + (1,) * (slope.ndim - 1))
     size = abs(slope)
     no_zero = is_known(size) and size.all()
     terms = size * far if no_zero else jnp.where(size == 0, 0, size * far)

@@ -30,9 +30,9 @@ from gsisio_jax.inclusion.node import (
     is_node,
     jac_of,
     join,
+    normalise,
+    normalised,
     parts,
-    settle,
-    settled,
     slope_of,
 )
 from gsisio_jax.inclusion.origin import remember
@@ -41,7 +41,7 @@ from gsisio_jax.inclusion.rules.piecewise import by_pieces
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.scalar.unroll import numbers_in
+from gsisio_jax.scalar.unroll import called_jaxpr, numbers_in
 
 # Longer loops, and loops over more operations, are kept as loops: compile time grows with every unrolled turn.
 _UNROLL = 16
@@ -100,7 +100,7 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
         return _call(eqn, *args) if CALLS.get(name) is _call else _constant(eqn, args)
     by_hand = _BY_HAND.get(name) or _BY_HAND.get(eqn.params.get("name"))
     if by_hand is not None:
-        value = settle(_apply_by_hand(by_hand, [settled(arg) for arg in args]))
+        value = normalise(_apply_by_hand(by_hand, [normalised(arg) for arg in args]))
         return [value] if eqn.primitive.multiple_results else value
     if name in CALLS:
         return CALLS[name](eqn, *args)
@@ -111,7 +111,7 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
         value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
         if name in ("select_n", "mul") and is_node(value):
             value = by_pieces(eqn, args, value, _result, ELEMENTWISE)
-        return settle(value) if is_node(value) and not value.unnormalised else value
+        return normalise(value) if is_node(value) and not value.unnormalised else value
     raise UnknownPrimitiveError(name)
 
 
@@ -123,7 +123,7 @@ def _constant(eqn: Any, args: Sequence[Any]) -> Any:
     if rounds and not all(map(is_known, args)):
         nodes = [as_node(arg, jnp.shape(arg), out.dtype) for arg in args]
         aligned = nodes if name in REDUCTIONS else _aligned(nodes, out.shape)
-        return settle((REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned))
+        return normalise((REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned))
     return fold(lambda *a: eqn.primitive.bind(*(jnp.asarray(v) for v in a), **eqn.params), *args)
 
 
@@ -145,20 +145,14 @@ def _caller(eqn: Any) -> str | None:
     return None
 
 
-def _body(eqn: Any) -> tuple[Any, Sequence[Any]]:
-    """The jaxpr that a call primitive runs; its parameter's name moves between primitives and JAX versions."""
-    for name in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
-        if name in eqn.params:
-            inner = eqn.params[name]
-            return (inner.jaxpr, inner.consts) if isinstance(inner, jex.ClosedJaxpr) else (inner, ())
-    raise UnknownPrimitiveError(eqn.primitive.name, "without a body")
-
-
 def _call(eqn: Any, *args: Any) -> Any:
-    jaxpr, consts = _body(eqn)
+    try:
+        jaxpr, consts = called_jaxpr(eqn)
+    except LookupError:
+        raise UnknownPrimitiveError(eqn.primitive.name, "without a body") from None
     name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
     if name in LIBRARY and source.startswith(_JAX) and any(is_node(arg) for arg in args):
-        return [settle(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
+        return [normalise(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
     return evaluate(jaxpr, consts, args)
 
 
@@ -215,7 +209,7 @@ def _loop(turn: Callable[..., Any], carry: list[Any], xs: Sequence[Any], length:
         """Entries of the scanned axis first, also in slopes and Jacobians."""
         if not is_node(x):
             return x
-        x = settled(x)
+        x = normalised(x)
         form = _form(x)
         form = None if form is None else (jnp.swapaxes(form.slope, 0, 1), form.folded())
         return x.range, form, jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), x.jac)
@@ -250,7 +244,7 @@ def _bare(value: Any) -> Any:
     """A node without the box, which is the same in every turn."""
     if not is_node(value):
         return value
-    value = settled(value)
+    value = normalised(value)
     form = _form(value)
     return value.range, None if form is None else (form.slope, form.folded()), value.jac
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from gsisio_jax.inclusion.mixed_monotone import decomposition, remainder
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.inclusion.transforms import AffineForm, affine, distance, jacobian, mean_value, natural
-from gsisio_jax.interval.box import Interval, choose, reach
+from gsisio_jax.interval.box import Interval, choose, magnitude
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.rounding import Rounding, lowered, raised, rounded_by, unbounded, up
 
@@ -111,7 +111,7 @@ def _mean_value_form(f: Callable[..., Any], box: Interval, *args: Any) -> Affine
     slope = jnp.where(finite, enclosure.center, 0)
     radius = jnp.where(finite, up(larger(enclosure.upper - slope, slope - enclosure.lower)), jnp.inf)
     radius = jnp.where(enclosure.lower == enclosure.upper, 0, radius)
-    around = reach(distance(box, center))
+    around = magnitude(distance(box, center))
     spread = jnp.where(around == 0, 0, jnp.where(radius == 0, 0, radius * around))
     at_center = natural(f)(Interval.unchecked(center, center), *args)
     moved = slope * center

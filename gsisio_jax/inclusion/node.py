@@ -11,8 +11,9 @@ Inside the engine the axis over the entries of ``x`` comes first, so that slopes
 
 Rounding: ranges, offsets and Jacobians are boxes, rounded outward by every operation here (see
 `gsisio_jax.interval.rounding`). A slope is rounded to nearest, and what that may have lost is kept beside it, as
-`slack`: times the reach of the box it belongs to the offset. Kept apart, because the box may be infinite, and because
-slopes of linear functions are often exact: then the form of such a function on an infinite box stays what it is.
+`slack`: times the magnitude of the box it belongs to the offset. Kept apart, because the box may be infinite, and
+because slopes of linear functions are often exact: then the form of such a function on an infinite box stays what it
+is.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import (
+    box_sum,
     finite_numbers,
     guard,
     is_exact,
@@ -35,13 +37,12 @@ from gsisio_jax.inclusion.form_arithmetic import (
     known_times,
     loosened,
     product,
-    shift,
+    slope_magnitude,
     slope_products,
-    slope_reach,
     spare,
 )
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, held, reach
+from gsisio_jax.interval.box import Interval, choose, computed_once, magnitude
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import add_up, fusion_barrier
 
@@ -56,11 +57,11 @@ class InputBox(eqx.Module):
 
     lower: Any
     upper: Any
-    reach: Any
+    magnitude: Any
 
     @classmethod
     def of(cls, box: Interval) -> InputBox:
-        return cls(box.lower, box.upper, abs(box.lower) if is_point(box) else reach(box))
+        return cls(box.lower, box.upper, abs(box.lower) if is_point(box) else magnitude(box))
 
 
 class Form(eqx.Module):
@@ -78,7 +79,7 @@ class Form(eqx.Module):
         """The offset that belongs to the slope alone."""
         if self.slack is None:
             return self.offset
-        return loosened(self.offset, slope_reach(self.slack, self.box), self.slope.shape[0] + 4.0)
+        return loosened(self.offset, slope_magnitude(self.slack, self.box), self.slope.shape[0] + 4.0)
 
     def image(self) -> Interval:
         """Bounds of the value that follow from the form alone."""
@@ -90,7 +91,7 @@ class Form(eqx.Module):
             return Interval.unchecked(lower, upper)
         n = low.shape[0] + 6.0
         # The slack counts whole; its own rounding is far below what it was taken too large by.
-        loss = 0 if self.slack is None else slope_reach(self.slack, self.box)
+        loss = 0 if self.slack is None else slope_magnitude(self.slack, self.box)
         lower = lower - (loss + rounding.error(add_up(abs(low), 0) + abs(self.offset.lower) + loss, n, n))
         upper = upper + (loss + rounding.error(add_up(abs(high), 0) + abs(self.offset.upper) + loss, n, n))
         return Interval.unchecked(lower, upper)
@@ -142,7 +143,7 @@ class Form(eqx.Module):
         share, floor = (np.where(exact, 0, value).astype(slope.dtype) for value in (n * info.eps, n * info.tiny))
         if self.slack is not None and self.slack.any():
             low_size, high_size = (
-                size + slope_reach(self.slack / share.max(), self.box) for size in (low_size, high_size)
+                size + slope_magnitude(self.slack / share.max(), self.box) for size in (low_size, high_size)
             )
         radius = jax.lax.stop_gradient(spare(exact, low_size * share) + floor)
         other = radius if same else jax.lax.stop_gradient(spare(exact, high_size * share) + floor)
@@ -156,7 +157,7 @@ class Node(eqx.Module):
     of its form, which is computed when it is asked for.
 
     Sums hand a NaN on, so it need not be looked for after each of them: `unnormalised` nodes may hold one where they
-    overflowed, until `settle` turns it into "no bound". Every rule that compares its arguments settles them first.
+    overflowed, until `normalise` turns it into "no bound". Every rule that compares its arguments does that first.
     """
 
     given: Interval | None
@@ -169,7 +170,7 @@ class Node(eqx.Module):
         if self.given is None:
             assert self.form is not None
             image = guard(self.form.image())
-            object.__setattr__(self, "given", image if is_known(image.lower) else held(image))
+            object.__setattr__(self, "given", image if is_known(image.lower) else computed_once(image))
         assert self.given is not None
         return self.given
 
@@ -208,9 +209,8 @@ def meet(node: Node) -> Node:
         return node
     natural, image = node.range, node.form.image()
     lower, upper = larger(natural.lower, image.lower), smaller(natural.upper, image.upper)
-    return Node(
-        held(choose(lower <= upper, Interval.unchecked(lower, upper), natural)), node.form, node.jac, node.unnormalised
-    )
+    met = choose(lower <= upper, Interval.unchecked(lower, upper), natural)
+    return Node(computed_once(met), node.form, node.jac, node.unnormalised)
 
 
 def best_form(slope: Any, offset: Interval, natural: Interval, box: InputBox, slack: Any = None, size: Any = 0) -> Form:
@@ -225,20 +225,20 @@ def best_form(slope: Any, offset: Interval, natural: Interval, box: InputBox, sl
     loss = _LOSS * jnp.finfo(width.dtype).eps * jax.lax.stop_gradient(size)
     good = jnp.isfinite(width) & (width - loss <= natural.upper - natural.lower)
     slack = None if slack is None else jnp.where(good, slack, 0)
-    return Form(fusion_barrier(jnp.where(good, slope, 0)), held(choose(good, offset, natural)), box, slack)
+    return Form(fusion_barrier(jnp.where(good, slope, 0)), computed_once(choose(good, offset, natural)), box, slack)
 
 
-def unsettled(given: Interval | None, form: Form | None, jac: Interval | None) -> Node:
-    """A node that a linear rule made; to nearest it is settled at once."""
+def unnormalised_node(given: Interval | None, form: Form | None, jac: Interval | None) -> Node:
+    """A node that a linear rule made; to nearest it is normalised at once."""
     return Node(given, form, jac, rounding.outward())
 
 
-def settled(value: Any) -> Any:
-    """`settle` where that has not been done."""
-    return settle(value) if is_node(value) and value.unnormalised else value
+def normalised(value: Any) -> Any:
+    """`normalise` where that has not been done."""
+    return normalise(value) if is_node(value) and value.unnormalised else value
 
 
-def settle(node: Node) -> Node:
+def normalise(node: Node) -> Node:
     """Last word on the result of every arithmetic rule, in all three domains: what overflowed is unbounded."""
     if not jnp.issubdtype(node.dtype, jnp.floating):
         return node
@@ -316,4 +316,4 @@ def join(a: Interval | None, b: Interval | None) -> Interval | None:
     """Sum of two Jacobians, absent ones being zero."""
     if a is None or b is None:
         return b if a is None else a
-    return sparse(shift(a, b), a, b)
+    return sparse(box_sum(a, b), a, b)

@@ -14,7 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, cast_down, cast_up, entire_like, is_concrete, products
+from gsisio_jax.interval.box import Interval, entire_like, is_concrete
+from gsisio_jax.interval.cast import cast_down, cast_up
+from gsisio_jax.interval.image import products
 
 
 class Abstraction(eqx.Module):

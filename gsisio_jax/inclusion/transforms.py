@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from gsisio_jax.inclusion.form_arithmetic import guard, is_known, is_point, product, shift, slope_image, sum_slack
+from gsisio_jax.inclusion.form_arithmetic import box_sum, guard, is_known, is_point, product, slope_image, sum_slack
 from gsisio_jax.inclusion.interpreter import evaluate
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node, is_node, jac_of, slack_of, slope_of
 from gsisio_jax.interval.box import Interval, choose
@@ -39,7 +39,7 @@ class AffineForm(eqx.Module):
     def over(self, box: Interval) -> Interval:
         """Bounds of f on a box inside X, from slope and offset alone; shape (*out)."""
         slope = jnp.moveaxis(jnp.asarray(self.slope), -1, 0)
-        return guard(shift(slope_image(slope, box.astype(slope.dtype)), self.offset))
+        return guard(box_sum(slope_image(slope, box.astype(slope.dtype)), self.offset))
 
 
 def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
@@ -137,7 +137,7 @@ def mean_value(f: Callable[..., Any], rounding: Rounding | None = None) -> Calla
 
         def combine(value: Interval, jac: Interval) -> Interval:
             moved = product(jac, around)
-            return guard(shift(value, Interval.unchecked(sum_down(moved.lower), sum_up(moved.upper))))
+            return guard(box_sum(value, Interval.unchecked(sum_down(moved.lower), sum_up(moved.upper))))
 
         return jax.tree.map(combine, middle, enclosure, is_leaf=lambda v: isinstance(v, Interval))
 
@@ -203,7 +203,7 @@ def _in_type(node: Node, dtype: Any) -> Node:
         lost = abs(slope) * np.dtype(dtype).type(2 * jnp.finfo(dtype).eps)
         slack = sum_slack(lost, None if form.slack is None else (2 * form.slack).astype(dtype))
         domain = InputBox(
-            *(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.reach))
+            *(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.magnitude))
         )
         form = Form(slope, form.offset.astype(dtype), domain, slack)
     return Node(node.range.astype(dtype), form, None if node.jac is None else node.jac.astype(dtype))

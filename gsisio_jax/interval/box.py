@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, Float
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.minmax import larger, smaller
-from gsisio_jax.interval.primitives import add_up, fusion_barrier, scale
+from gsisio_jax.interval.cast import cast_down, cast_towards, cast_up
+from gsisio_jax.interval.minmax import cut, larger, raised, smaller
+from gsisio_jax.interval.primitives import fusion_barrier
 
 
 def is_concrete(value: Any) -> bool:
@@ -163,7 +163,9 @@ def _namespace(*values: Any) -> Any:
 def _representable(value: Any, towards: float) -> Any:
     """A host array that JAX would round when it sees it, rounded outward before."""
     dtype = jax.dtypes.canonicalize_dtype(value.dtype)
-    return value if isinstance(value, jax.Array) or value.dtype == dtype else np.asarray(_cast(value, dtype, towards))
+    if isinstance(value, jax.Array) or value.dtype == dtype:
+        return value
+    return np.asarray(cast_towards(value, dtype, towards))
 
 
 def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
@@ -184,135 +186,6 @@ def _check_values(lower: np.ndarray, upper: np.ndarray) -> None:
         )
 
 
-def _cast(value: Any, dtype: Any, towards: float) -> Any:
-    dtype = jax.dtypes.canonicalize_dtype(dtype)
-    if value.dtype == dtype:
-        return jnp.asarray(value)
-    tiny = float(jnp.finfo(dtype).tiny)
-    if isinstance(value, np.ndarray | np.generic):
-        # On the host, before JAX sees the number: with 64-bit types off, JAX itself would round to nearest.
-        exact: Any = value
-        with np.errstate(all="ignore"):
-            cast = np.asarray(exact, dtype)
-            wrong = cast > exact if towards < 0 else cast < exact
-            moved = np.nextafter(cast, np.asarray(towards, dtype))
-            # Compiled code takes subnormal numbers for zero: they are no bounds.
-            moved = np.where(np.abs(moved) < tiny, np.copysign(tiny, towards), moved)
-            return jnp.asarray(np.where(wrong, moved, cast), dtype)
-    cast = value.astype(dtype)
-    if jnp.finfo(dtype).bits >= jnp.finfo(value.dtype).bits:
-        return cast
-    back = cast.astype(value.dtype)
-    wrong = back > value if towards < 0 else back < value
-    # nextafter has no derivative rule: add its step as a constant, so that gradients see a plain cast.
-    fixed = jax.lax.stop_gradient(cast)
-    step = jax.lax.stop_gradient(jnp.nextafter(fixed, jnp.asarray(towards, dtype)) - fixed)
-    largest = jnp.finfo(dtype).max if towards < 0 else jnp.finfo(dtype).min
-    moved = jnp.where(jnp.isfinite(fixed), cast + jnp.where(jnp.isfinite(step), step, 0), largest)
-    moved = jnp.where(abs(fixed) <= tiny, jnp.copysign(2 * tiny, towards), moved)
-    return jnp.where(wrong, moved, cast)
-
-
-def cast_down(value: Any, dtype: Any) -> Any:
-    """Cast to `dtype`, towards minus infinity where the number does not fit."""
-    return _cast(value, dtype, -np.inf)
-
-
-def cast_up(value: Any, dtype: Any) -> Any:
-    """Cast to `dtype`, towards infinity where the number does not fit."""
-    return _cast(value, dtype, np.inf)
-
-
-def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
-    """Bound the image of a box under a constant matrix (exact in real arithmetic).
-
-    Args:
-        matrix: shape (m, n), finite, units [y]/[x].
-        x: box of shape (n,), units [x]; infinite sides allowed (``0 * inf = 0``).
-
-    Returns:
-        Box of shape (m,), units [y].
-
-    Raises:
-        ValueError: shapes do not agree.
-
-    >>> linear_image(np.array([[1.0, -2.0]]), Interval([0.0, 0.0], [1.0, 1.0]))
-    Interval([-2.], [1.])
-
-    Source: paper, Prop. 2 and Lemma 1.
-    """
-    if np.ndim(matrix) != 2 or len(x.shape) != 1 or matrix.shape[1] != x.shape[0]:
-        raise ValueError(
-            f"linear_image: a matrix (m, n) and a box (n,) are needed, got {np.shape(matrix)} and {x.shape}"
-        )
-    return nan_to_unbounded(image(matrix, x.astype(jnp.result_type(matrix, x.dtype))))
-
-
-def image(matrix: Any, x: Interval) -> Interval:
-    """`linear_image` without its checks, for a stack of matrices (..., m, n) and boxes (n,) or (..., n).
-
-    Rounded outward, also for the exact product with a matrix that was rounded to `matrix` entry by entry. NaN where it
-    overflows, see `nan_to_unbounded`.
-    """
-    low, high = products(matrix, x)
-    # A sum of products, not a dot: the batched dot of a tiny matrix is slow, and 0 * inf must not reach it.
-    return Interval.unchecked(rounding.sum_down(low), rounding.sum_up(high))
-
-
-def widened(box: Interval, terms: int) -> Interval:
-    """The box, wider by what `plain_image` loses in a sum of so many terms, whatever the weights are.
-
-    A sum of n products of weights that were rounded once is off by ``(n + 4) eps sum |w_i| |x_i|`` at most, and every
-    side is moved by ``kappa |x_i|`` with ``kappa = (n + 8) eps``; what is flushed to zero is in ``2^60 tiny``
-    (`rounding.generous`).
-    """
-    if not rounding.outward():
-        return box
-    info = jnp.finfo(box.dtype)
-    kind = np.dtype(box.dtype).type
-    kappa, floor = kind((terms + 8) * float(info.eps)), kind(2.0**60 * float(info.tiny))
-    lower, upper = (jax.lax.stop_gradient(abs(side)) * kappa + floor for side in (box.lower, box.upper))
-    return Interval.unchecked(box.lower - lower, box.upper + upper)
-
-
-def plain_image(matrix: Any, x: Interval) -> Interval:
-    """`image` of a box that has been through `widened`: sums as they come. NaN where it overflows."""
-    low, high = products(matrix, x)
-    floor = faint(matrix)
-    return Interval.unchecked(low.sum(-1) - floor, high.sum(-1) + floor)
-
-
-def faint(weights: Any) -> Any:
-    """What rows (..., n) with weights below ``2^-40`` may lose where products are flushed to zero, beyond what was
-    widened before them: that was multiplied by the weight, too. 0 for all other rows."""
-    if not rounding.outward():
-        return 0.0
-    small = ((weights != 0) & (abs(weights) < 2.0**-40)).any(-1)
-    dtype = jnp.result_type(weights)
-    return jnp.where(small, jnp.asarray(2.0**10 * float(jnp.finfo(dtype).tiny), dtype), 0)
-
-
-def products(matrix: Any, x: Interval) -> tuple[Any, Any]:
-    """Smallest and largest of every product in ``matrix @ x``, (..., m, n), to nearest; for `rounding.sum_down`."""
-    at_lower, at_upper = scale(matrix, x.lower[..., None, :]), scale(matrix, x.upper[..., None, :])
-    # Sides are chosen by sign, not by min and max: those tie on boxes of width 0 and would halve the derivative of the
-    # width.
-    up = matrix >= 0
-    return jnp.where(up, at_lower, at_upper), jnp.where(up, at_upper, at_lower)
-
-
-def spread(matrix: Any, reach: Any) -> Any:
-    """Upper bound of ``matrix @ reach`` for a nonnegative matrix (..., m, n) and reach (n,) or (..., n)."""
-    return rounding.sum_up(scale(matrix, reach[..., None, :]))
-
-
-def slip(matrix: Any, reach: Any) -> Any:
-    """`spread` for matrices of the size of rounding, with less work and a thousandth more (`rounding.generous`);
-    exactly 0 for rows of zeros."""
-    found = rounding.generous(add_up(scale(matrix, reach[..., None, :])))
-    return jnp.where((matrix != 0).any(-1), found, 0)
-
-
 def add(*boxes: Interval) -> Interval:
     """Minkowski sum of boxes; NaN where it overflows, see `nan_to_unbounded`."""
     return Interval.unchecked(_add_down([box.lower for box in boxes]), -_add_down([-box.upper for box in boxes]))
@@ -328,8 +201,8 @@ def _add_down(values: list[Any]) -> Any:
     return rounding.lowered(total, size, len(values))
 
 
-def held(box: Interval) -> Interval:
-    """The box itself, whose bounds are computed once however often they are used; see `once`."""
+def computed_once(box: Interval) -> Interval:
+    """The box itself, whose bounds are computed once however often they are used; see `fusion_barrier`."""
     return Interval.unchecked(fusion_barrier(box.lower), fusion_barrier(box.upper))
 
 
@@ -345,9 +218,15 @@ def widen(box: Interval, radius: Any) -> Interval:
     return box if radius is None else add(box, Interval.unchecked(-radius, radius))
 
 
-def reach(box: Interval) -> Any:
+def magnitude(box: Interval) -> Any:
     """Largest magnitude in the box, elementwise."""
     return jnp.maximum(abs(box.lower), abs(box.upper))
+
+
+def center_and_radius(box: Interval) -> tuple[Any, Any]:
+    """Center and radius of a traced box, to nearest; an infinite side makes the radius infinite and the center 0."""
+    radius = 0.5 * (box.upper - box.lower)
+    return jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0), radius
 
 
 def entire_like(box: Any) -> Interval:
@@ -376,9 +255,10 @@ def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
     Returns:
         The intersection, and the slack ``min(a.upper - b.lower, b.upper - a.lower)``: how far one box could be moved
         before they miss each other. A negative slack is the size of the gap; there the first box is returned
-        unchanged, so the result is never crossed: the caller must look at the slack.
+        unchanged, so the result is never crossed: the caller must look at the slack. A side of b that is NaN (it
+        overflowed) is passed over.
     """
     slack = smaller(a.upper - b.lower, b.upper - a.lower)
-    empty = slack < 0
-    lower, upper = larger(a.lower, b.lower), smaller(a.upper, b.upper)
+    lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
+    empty = upper < lower
     return Interval.unchecked(jnp.where(empty, a.lower, lower), jnp.where(empty, a.upper, upper)), slack

@@ -47,6 +47,8 @@ Rounding = Literal["outward", "nearest"]
 _MODE: ContextVar[str] = ContextVar("gsisio_jax_rounding", default="outward")
 _NORMAL: ContextVar[bool] = ContextVar("gsisio_jax_normal", default=False)
 _FLOOR = 4.0  # smallest normal numbers that every widening adds
+FLUSHED = 2.0**60
+"""Smallest normal numbers that cover whatever is lost where the terms of a sum are flushed to zero; see `generous`."""
 
 
 def check_rounding(call: str, rounding: str) -> None:
@@ -158,11 +160,11 @@ def generous(radius: Any) -> Any:
     Relative errors of such numbers add up: with fewer than ``2^12`` operations on the way to any of them they stay
     below ``2^-10`` (float32: ``2^12 2^-23``; float64 has room to spare). A product that is flushed to zero loses tiny,
     and fewer than ``2^60`` are added; where a radius is multiplied once more, what it lost before has been added to it
-    already (here, or in `contractors._reached`). For radii that stand for rounding themselves, where a share of a
+    already, here. For radii that stand for rounding themselves, where a share of a
     thousandth is nothing.
     """
     kind = np.dtype(radius.dtype).type
-    return fusion_barrier(radius * kind(1 + 2.0**-10) + kind(2.0**60 * float(jnp.finfo(radius.dtype).tiny)))
+    return fusion_barrier(radius * kind(1 + 2.0**-10) + kind(FLUSHED * float(jnp.finfo(radius.dtype).tiny)))
 
 
 def sum_down(terms: Any, axis: int = -1) -> Any:

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from gsisio_jax.interval.box import Interval, plain_image, widened
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.image import plain_image, widened_for_sums
 
 
 class LinearBounds(eqx.Module):
@@ -41,7 +42,7 @@ class LinearBounds(eqx.Module):
         boxes = (terms.shift, terms.output, terms.bounds, terms.known)
         lower = jnp.concatenate([box.lower for box in boxes])
         joined = Interval.unchecked(lower, jnp.concatenate([box.upper for box in boxes]))
-        return plain_image(weights, widened(joined, weights.shape[-1]))
+        return plain_image(weights, widened_for_sums(joined, weights.shape[-1]))
 
 
 class CancellationResidual(eqx.Module):

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax.inclusion.atoms import States, wider
-from gsisio_jax.interval.box import Interval, choose, plain_image
-from gsisio_jax.interval.minmax import cut, raised, smaller
+from gsisio_jax.interval.box import Interval, choose, intersect
+from gsisio_jax.interval.image import plain_image
 from gsisio_jax.interval.primitives import matmul
 from gsisio_jax.observer.bank import Known
 from gsisio_jax.observer.contractors import centred_form
@@ -26,7 +26,7 @@ class Promised(NamedTuple):
 
     applies: Any
     center: Any
-    slip: Any
+    center_error: Any
     radius: Any
     atoms: Any
 
@@ -45,11 +45,11 @@ def certified(
     # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
     c = jnp.where(applies, past.center, jnp.asarray(region.center, right.dtype))
     radius = jnp.where(applies, past.radius, 0)
-    promised = Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.slip))
+    promised = Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.value_error))
     gains, constants = observer.gains, observer.rounding_constants
     around = _around(maps, gains.residual[0], constants.growth, promised, known.right[0])
     around = plainly_wider(around, _first(left))
-    joint, slack = _met(right[0], around)
+    joint, slack = intersect(right[0], around)
     domain = domain.record_margin(jnp.where(applies, slack, jnp.inf), Source.STATE)
     joint = choose(applies, joint, Interval.unchecked(c, c))
     safe = choose(applies, domain.box, Interval.unchecked(c, c))
@@ -61,20 +61,12 @@ def certified(
     return domain.intersect(everything_unless(applies, box)[None], Source.CERTIFICATE), promised
 
 
-def _met(a: Interval, b: Interval) -> tuple[Interval, Any]:
-    """Intersection and slack; the first box where they miss each other."""
-    lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
-    empty = upper < lower
-    slack = smaller(a.upper - b.lower, b.upper - a.lower)
-    return Interval.unchecked(jnp.where(empty, a.lower, lower), jnp.where(empty, a.upper, upper)), slack
-
-
 def _around(maps: Maps, weights: Any, slope: Any, promised: Promised, known: Interval) -> Interval:
     """A linear bound without its terms in x[k]: its value at the centre of the old box, give or take ``slope radius``.
 
     No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
     """
-    center, radius = at_point(maps.rows(weights), promised.center, promised.slip, *promised.atoms)
+    center, radius = at_point(maps.rows(weights), promised.center, promised.center_error, *promised.atoms)
     radius = radius + matmul(jnp.asarray(slope, radius.dtype), promised.radius)
     radius = radius + wider(abs(center) + radius, 0)
     return Interval.unchecked(center - radius + known.lower, center + radius + known.upper)
@@ -102,5 +94,5 @@ def certified_input(
     around = plainly_wider(around, _first(left))
     now = plain_image(inverses.state[0], states.wide)
     box = Interval.unchecked(now.lower + around.lower, now.upper + around.upper)
-    met, slack = _met(d, everything_unless(promised.applies, box))
+    met, slack = intersect(d, everything_unless(promised.applies, box))
     return met, domain.record_margin(slack, Source.INPUT)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, wider
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.box import Interval, center_and_radius
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import matmul, scale
 
@@ -33,7 +33,7 @@ class Affine(NamedTuple):
 def affine_rows(rows: Rows, states: States, atoms: AtomBounds) -> Affine:
     """Linear combinations of atoms as affine bounds; the radius holds what the slope is off by."""
     center = matmul(rows.atoms, atoms.center) + rows.constant
-    radius = scale(abs(rows.atoms), atoms.radius).sum(-1) + scale(abs(rows.states), states.slip).sum(-1)
+    radius = scale(abs(rows.atoms), atoms.radius).sum(-1) + scale(abs(rows.states), states.error).sum(-1)
     return Affine(rows.slope(atoms), center, radius + of_constant(rows.constant))
 
 
@@ -97,7 +97,7 @@ def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, term
     identity = jnp.eye(q, dtype=D.dtype)
     small = identity + matmul(D, N_z)  # (K, q, q)
     B, E, verified = _verified_inverse(small)
-    center, radius = center_and_radius(right, terms)
+    center, radius = _center_and_wider_radius(right, terms)
     center = center - matmul(N_z, psi.center)
     radius = radius + scale(abs(N_z), psi.radius).sum(-1)
     M = jnp.eye(n, dtype=D.dtype) - matmul(N_z, matmul(B, D))
@@ -116,11 +116,9 @@ def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, term
     return Interval.unchecked(jnp.where(keep, middle - spread, -jnp.inf), jnp.where(keep, middle + spread, jnp.inf))
 
 
-def center_and_radius(box: Interval, terms: int) -> tuple[Any, Any]:
-    """Center and radius of a box, the latter widened for linear images of so many terms; an infinite side makes it
-    infinite."""
-    radius = 0.5 * (box.upper - box.lower)
-    center = jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0)
+def _center_and_wider_radius(box: Interval, terms: int) -> tuple[Any, Any]:
+    """`center_and_radius`, the latter widened for linear images of so many terms."""
+    center, radius = center_and_radius(box)
     return center, radius + wider(abs(center) + radius, terms)
 
 
@@ -166,15 +164,15 @@ def centred_form(
 
     Source: theory 5.3 and 5.6.
     """
-    middle, radius = center_and_radius(right, terms)
+    middle, radius = _center_and_wider_radius(right, terms)
     before = clip(middle, within)
-    center, slip = remainder(before)
+    center, error = remainder(before)
     c = clip(middle - matmul(N_z, center), within)
-    slip = matmul(abs(N_z), slip) + wider(abs(middle) + matmul(abs(N_z), abs(center)), terms)
+    error = matmul(abs(N_z), error) + wider(abs(middle) + matmul(abs(N_z), abs(center)), terms)
     move = abs(c - before)
     if left is not None and rounding.outward():
-        slip = slip + rounding.generous(matmul(left, abs(c)))
-    far = radius + slip + move
+        error = error + rounding.generous(matmul(left, abs(c)))
+    far = radius + error + move
     away = scale(inverse, far).sum(-1)
     away = away - move + wider(abs(c) + away + far, terms)
     return Interval.unchecked(c - away, c + away)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,17 +10,8 @@ import jax.numpy as jnp
 from gsisio_jax.inclusion.atoms import wider
 from gsisio_jax.inclusion.transforms import affine_with_slack
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import (
-    Interval,
-    choose,
-    entire_like,
-    image,
-    plain_image,
-    reach,
-    slip,
-    spread,
-    widened,
-)
+from gsisio_jax.interval.box import Interval, choose, entire_like, magnitude
+from gsisio_jax.interval.image import image, loose_matvec_upper, matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.observer.contractors import Affine, centred_form
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.maps import Maps, at_point
@@ -29,16 +20,33 @@ from gsisio_jax.observer.status import Source
 from gsisio_jax.observer.types import Observer
 
 
-def first_form(observer: Observer, box: Interval, u: Any) -> Affine:
-    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes. For x in `box`."""
-    known, slack = observer.first.form, observer.first.slack
-    if known is None:
-        function = affine_with_slack(lambda x, u: observer.T2 @ observer.system.measurement(x, u))
-        known, slack = function(observer.system.state_bounds, u)
-    center, radius = known.offset.center, known.offset.radius
-    if rounding.outward():
-        radius = radius + wider(abs(center) + jnp.where(jnp.isfinite(radius), radius, 0), 0) + slip(slack, reach(box))
-    return Affine(known.slope, center, radius)
+class FirstForm(NamedTuple):
+    """Affine bounds of T2 g on the state bounds: the one method that serves on infinite boxes.
+
+    The radius lacks what the slope is off by, which is `slack` (q, n) times ``|x|``; see `on`.
+    """
+
+    slope: Any
+    center: Any
+    radius: Any
+    slack: Any
+
+    @classmethod
+    def of(cls, observer: Observer, u: Any) -> FirstForm:
+        """As the design has left it; where g takes u, for the u of this step."""
+        known, slack = observer.first.form, observer.first.slack
+        if known is None:
+            function = affine_with_slack(lambda x, u: observer.T2 @ observer.system.measurement(x, u))
+            known, slack = function(observer.system.state_bounds, u)
+        center, radius = known.offset.center, known.offset.radius
+        if rounding.outward():
+            radius = radius + wider(abs(center) + jnp.where(jnp.isfinite(radius), radius, 0), 0)
+        return cls(known.slope, center, radius, slack)
+
+    def on(self, box: Interval) -> Affine:
+        """For x in `box`, a part of the state bounds."""
+        radius = self.radius + loose_matvec_upper(self.slack, magnitude(box)) if rounding.outward() else self.radius
+        return Affine(self.slope, self.center, radius)
 
 
 def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: Any) -> Domain:
@@ -55,7 +63,7 @@ def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: A
     observer = maps.observer
     first, gains = observer.first, observer.gains
     if rounding.outward():
-        lost = slip(observer.rounding_constants.gains.d, inputs)
+        lost = loose_matvec_upper(observer.rounding_constants.gains.d, inputs)
         right = Interval.unchecked(right.lower - lost, right.upper + lost)
     for i, k in enumerate(first.gains):
         if k in first.linear:
@@ -73,10 +81,10 @@ def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: A
         chosen, N_z = jax.tree.map(lambda x: jnp.stack([x[k] for k in first.linear]), (right, gains.remainder))
         offset = image(-N_z, first.form.offset)
         shifted = Interval.unchecked(chosen.lower + offset.lower, chosen.upper + offset.upper)
-        boxes = plain_image(first.maps, widened(shifted, first.maps.shape[-1]))
+        boxes = plain_image(first.maps, widened_for_sums(shifted, first.maps.shape[-1]))
         if rounding.outward():
-            far = jnp.minimum(spread(first.bounds, reach(boxes)), reach(domain.box))
-            left = slip(first.left, far)
+            far = jnp.minimum(matvec_upper(first.bounds, magnitude(boxes)), magnitude(domain.box))
+            left = loose_matvec_upper(first.left, far)
             boxes = Interval.unchecked(boxes.lower - left, boxes.upper + left)
         domain = domain.intersect(boxes, Source.STATE)
     return domain

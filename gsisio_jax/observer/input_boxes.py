@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.atoms import States
-from gsisio_jax.interval.box import Interval, is_concrete, plain_image, widened
+from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.interval.image import plain_image, widened_for_sums
 from gsisio_jax.interval.minmax import smaller
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.bank import Terms
@@ -32,7 +33,7 @@ def from_inverses(maps: Maps, domain: Domain, states: States, fixed: Interval, p
     loose = scale(abs(slope), states.radius).sum(-1) + scale(abs(inverses.remainder), psi.radius).sum(-1)
     # What rounding the slope has lost, where it was combined.
     combined = jnp.where((inverses.remainder != 0).any(-1, keepdims=True), abs(inverses.state), 0)
-    loose = loose + scale(combined, states.slip).sum(-1)
+    loose = loose + scale(combined, states.error).sum(-1)
     now = Interval.unchecked(fixed.lower + (middle - loose), fixed.upper + (middle + loose))
     d = Domain.of(limits, 0.0).intersect(now, Source.INPUT)
     return d.box, domain.taken(d)
@@ -48,8 +49,8 @@ def moved_without(maps: Maps, past: States, carry: Carry, terms: Terms) -> Inter
 def dynamics(maps: Maps, domain: Domain, moved: Interval, d: Interval) -> Domain:
     """``x = f + B u + G d + w``: no way to a first box, but a contraction of a correct one (paper, Algorithm 1)."""
     system = maps.observer.system
-    through = plain_image(system.G, widened(d, system.p + 2))
-    moved = widened(moved[: system.n], 2)
+    through = plain_image(system.G, widened_for_sums(d, system.p + 2))
+    moved = widened_for_sums(moved[: system.n], 2)
     now = Interval.unchecked(moved.lower + through.lower, moved.upper + through.upper)
     return domain.intersect(now[None], Source.DYNAMICS)
 
@@ -92,7 +93,7 @@ def exact_input(
     if not observer.system.p:
         return d, domain
     terms = explained.shape[0] + known.shape[0]
-    joined = widened(_joined(explained, known), terms)
+    joined = widened_for_sums(_joined(explained, known), terms)
 
     def image_of(rows: Any, of_known: Any, residual: Any) -> Interval:
         found = plain_image(jnp.concatenate([rows, of_known], -1), joined)

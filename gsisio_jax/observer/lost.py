@@ -7,7 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, reach, slip
+from gsisio_jax.interval.box import Interval, magnitude
+from gsisio_jax.interval.image import loose_matvec_upper
 from gsisio_jax.interval.minmax import cut
 from gsisio_jax.observer.bank import CancellationResidual
 from gsisio_jax.observer.types import Observer
@@ -20,26 +21,27 @@ class Lost:
     """
 
     def __init__(self, observer: Observer, d_fixed: Interval):
-        self.constants, self.limit = observer.rounding_constants, reach(observer.system.input_bounds)
+        self.constants, self.limit = observer.rounding_constants, magnitude(observer.system.input_bounds)
         self.inputs = jnp.asarray(self.limit)
         if rounding.outward():
             for i, j in enumerate(self.constants.direct):
-                self.inputs = cut(self.inputs, slip(self.constants.input_inverses[i], reach(d_fixed[j])))
+                V = self.constants.input_inverses[i]
+                self.inputs = cut(self.inputs, loose_matvec_upper(V, magnitude(d_fixed[j])))
 
-    def reaches(self, box: Interval) -> tuple[Any, Any]:
+    def magnitudes(self, box: Interval) -> tuple[Any, Any]:
         """Bounds of ``|x[k]|`` (n,) and ``|d[k-1]|`` (p,), from a box of x[k]."""
-        x = reach(box)
-        return x, cut(jnp.asarray(self.limit), self.inputs + slip(self.constants.input_state, x))
+        x = magnitude(box)
+        return x, cut(jnp.asarray(self.limit), self.inputs + loose_matvec_upper(self.constants.input_state, x))
 
     def radius(self, residual: CancellationResidual, box: Interval) -> Any:
         """Radius (K, r) by which a bank's bounds are to be widened; None to nearest."""
         if not rounding.outward():
             return None
-        return slip(jnp.concatenate([residual.x, residual.d], -1), jnp.concatenate(self.reaches(box)))
+        return loose_matvec_upper(jnp.concatenate([residual.x, residual.d], -1), jnp.concatenate(self.magnitudes(box)))
 
     def of_inputs(self, weights: Any, box: Interval) -> Any:
         """The same for rows that leave only d[k-1], (..., p)."""
-        return slip(weights, self.reaches(box)[1]) if rounding.outward() else None
+        return loose_matvec_upper(weights, self.magnitudes(box)[1]) if rounding.outward() else None
 
 
 def plainly_wider(box: Interval, radius: Any) -> Interval:

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, widened, wider
+from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, widened_atoms, wider
 from gsisio_jax.inclusion.expansion import Expansion
 from gsisio_jax.inclusion.intersection import DEFAULT, bound
 from gsisio_jax.inclusion.reader import expand
-from gsisio_jax.interval.box import Interval, is_concrete, reach
+from gsisio_jax.interval.box import Interval, is_concrete, magnitude
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.measurement import value_at
 from gsisio_jax.observer.types import Observer
@@ -83,9 +83,9 @@ class Maps:
         if self.expansion is not None:
             return self.expansion.bounds(states, u, with_values=promised)
         form = bound(observer.system.maps, observer.bounds, observer.abstraction)(box, u)
-        found = widened(form.slope, form.offset, form.range, states, self.terms)
-        value, slip = self._at(observer.system.maps, states.center, u) if promised else (None, None)
-        return replace(found, value=value, slip=slip)
+        found = widened_atoms(form.slope, form.offset, form.range, states, self.terms)
+        value, error = self._at(observer.system.maps, states.center, u) if promised else (None, None)
+        return replace(found, value=value, value_error=error)
 
     def free_bounds(self, states: States, box: Interval, u: Any) -> AtomBounds:
         """Atoms of T2 g on a box."""
@@ -93,7 +93,7 @@ class Maps:
             return self.expansion.bounds(states, u, self.expansion.used_by(self.free))
         observer = self.observer
         form = bound(self._free_map, observer.bounds, observer.output_abstraction)(box, u)
-        return widened(form.slope, form.offset, form.range, states, self.terms)
+        return widened_atoms(form.slope, form.offset, form.range, states, self.terms)
 
     def free_at(self, x: Any, u: Any) -> tuple[Any, Any]:
         """Atoms of T2 g at a point, and what rounding leaves of them."""
@@ -103,8 +103,13 @@ class Maps:
 
     def _at(self, function: Any, x: Any, u: Any) -> tuple[Any, Any]:
         value = value_at(function, x, u)
-        extra = wider(reach(value), self.terms)
+        extra = wider(magnitude(value), self.terms)
         return value.center, value.radius + extra
+
+    def on_outputs(self, weights: Any) -> Any:
+        """Weights (r, l) of g as weights (r, n + l) of [f; g]."""
+        xp = np if is_concrete(weights) else jnp
+        return xp.concatenate([xp.zeros((weights.shape[0], self.observer.system.n)), weights], axis=1)
 
     def rows(self, weights: Any) -> Rows:
         """``weights @ [f; g]`` for weights (r, n + l), over `bounds`."""
@@ -123,11 +128,9 @@ class Maps:
         return self._free_rows(self.observer.C)
 
     def _free_rows(self, minus: Any) -> Rows:
-        T2, n = self.observer.T2, self.observer.system.n
+        T2 = self.observer.T2
         if self.expansion is not None:
-            xp = np if is_concrete(T2) else jnp
-            weights = xp.concatenate([xp.zeros((T2.shape[0], n)), T2], axis=1)
-            return self.expansion.rows(weights, self.dtype, minus)
+            return self.expansion.rows(self.on_outputs(T2), self.dtype, minus)
         return self._over_arrays(jnp.eye(T2.shape[0], dtype=self.dtype), minus)
 
     def _over_arrays(self, weights: Any, minus: Any) -> Rows:
@@ -140,8 +143,8 @@ class Maps:
         return self.observer.T2 @ self.observer.system.measurement(x, u)
 
 
-def at_point(rows: Rows, x: Any, slip: Any, value: Any, value_slip: Any) -> tuple[Any, Any]:
+def at_point(rows: Rows, x: Any, x_error: Any, value: Any, value_error: Any) -> tuple[Any, Any]:
     """Center and radius (r,) of a linear combination at a point x, from values of the atoms there."""
     center = matmul(rows.states, x) + matmul(rows.atoms, value) + rows.constant
-    radius = matmul(abs(rows.states), slip) + scale(abs(rows.atoms), value_slip).sum(-1)
+    radius = matmul(abs(rows.states), x_error) + scale(abs(rows.atoms), value_error).sum(-1)
     return center, radius + of_constant(rows.constant)

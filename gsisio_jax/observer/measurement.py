@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from gsisio_jax import inclusion
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, add, choose, entire_like, image
+from gsisio_jax.interval.box import Interval, add, choose, entire_like
+from gsisio_jax.interval.image import image
 from gsisio_jax.plant.system import System
 
 
@@ -21,12 +22,12 @@ def value_at(function: Any, x: Any, *args: Any) -> Interval:
 
 def output_box(system: System, y: Any, u: Any, v: Interval) -> Interval:
     """Box of ``y - D u - v``: of ``g(x) + H d``; all of R where y is NaN (or infinite: batches cannot refuse it). To be
-    `widened` before it is used."""
+    `widened_for_sums` before it is used."""
     missing = ~jnp.isfinite(y)
     seen = jnp.where(missing, 0, y)
     if system.m:
         known = add(point(seen), Interval.unchecked(-v.upper, -v.lower), image(-system.D, point(u)))
-    else:  # one rounding, which `widened` has room for
+    else:  # one rounding, which `widened_for_sums` has room for
         known = Interval.unchecked(seen - v.upper, seen - v.lower)
     return choose(missing, entire_like(known), known)
 

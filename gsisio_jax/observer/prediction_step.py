@@ -17,8 +17,9 @@ from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.intersection import bound
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, add, choose, image, intersect, nan_to_unbounded, reach, scale, slip, widen
-from gsisio_jax.interval.primitives import multiplied
+from gsisio_jax.interval.box import Interval, add, choose, intersect, magnitude, nan_to_unbounded, widen
+from gsisio_jax.interval.image import image, loose_matvec_upper
+from gsisio_jax.interval.primitives import multiplied, scale
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.domain import Domain, largest_magnitude
@@ -161,7 +162,8 @@ def _current_input(current: Any, h: AffineForm, state: Interval, output: Interva
     slope = multiplied(weights, h.slope[n:])
     joint = add(image(slope, state), image(weights, h.offset[n:]))
     if rounding.outward():
-        lost = slip(abs(weights), slip(abs(h.slope[n:]), reach(state)))  # of the slopes before they cancelled
+        # Of the slopes before they cancelled.
+        lost = loose_matvec_upper(abs(weights), loose_matvec_upper(abs(h.slope[n:]), magnitude(state)))
         joint = widen(joint, rounding.error(lost, h.slope.shape[0] - n + 6.0))
     return nan_to_unbounded(add(intersect(joint, image(weights, h.range[n:]))[0], image(current, output)))
 

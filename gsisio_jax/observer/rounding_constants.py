@@ -20,7 +20,8 @@ import numpy as np
 from gsisio_jax import inclusion
 from gsisio_jax.inclusion.transforms import AffineForm, affine_with_slack
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, cast_down, cast_up
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.cast import cast_down, cast_up
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.residuals import (
     cancellation_residual,
@@ -81,7 +82,7 @@ def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) ->
             boxes = known(box, dtype), known(u_box, dtype)
             if not program:
                 program.append(numpy_function(enclose, *boxes))
-            parts = [_center_and_radius(jacobian) for jacobian in program[0](*boxes)]
+            parts = [_center_and_distance(jacobian) for jacobian in program[0](*boxes)]
         return Slopes(*parts[0], *parts[1], *parts[2])
 
     return on
@@ -100,10 +101,11 @@ def _able_to_hold(dtype: Any) -> Any:
     return jax.enable_x64(True) if np.dtype(dtype) == np.float64 else nullcontext()
 
 
-def _center_and_radius(jacobian: Interval) -> tuple[np.ndarray, np.ndarray]:
+def _center_and_distance(jacobian: Interval) -> tuple[np.ndarray, np.ndarray]:
+    """The center as it is in float64, and the largest distance from it, rounded up; 0 for points."""
     lower, upper = np.array(jacobian.lower, dtype=np.float64), np.array(jacobian.upper, dtype=np.float64)
-    with np.errstate(invalid="ignore"):
-        center = np.where(np.isfinite(lower) & np.isfinite(upper), 0.5 * lower + 0.5 * upper, 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        center = Interval.unchecked(lower, upper).center
         radius = np.maximum(upper - center, center - lower)
     return center, np.where(lower == upper, 0.0, np.nextafter(radius, np.inf))
 

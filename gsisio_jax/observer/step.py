@@ -10,26 +10,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import (
-    Interval,
-    add,
-    choose,
-    entire_like,
-    image,
-    is_concrete,
-    nan_to_unbounded,
-    plain_image,
-    widened,
-)
+from gsisio_jax.interval.box import Interval, add, choose, entire_like, nan_to_unbounded
+from gsisio_jax.interval.image import image, plain_image, widened_for_sums
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
 from gsisio_jax.observer.domain import Domain, largest_magnitude
-from gsisio_jax.observer.initial import first_form, initial_boxes
+from gsisio_jax.observer.initial import FirstForm, initial_boxes
 from gsisio_jax.observer.input_boxes import dynamics, exact_from_box, from_inverses, moved_without
 from gsisio_jax.observer.lost import Lost, plainly_wider
 from gsisio_jax.observer.maps import Maps
@@ -87,7 +77,7 @@ def _known(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) -> Kn
         terms,
         observer.gains.linear(terms),
         observer.inverses.linear(terms),
-        plain_image(observer.T2, widened(output, system.l)),
+        plain_image(observer.T2, widened_for_sums(output, system.l)),
     )
 
 
@@ -105,11 +95,11 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
     # 3. y[k] and the state bounds, which are all that a restart begins with, and the initial box, if this is the start;
     # then what needs no box to begin with.
     with _stage("initial"):
-        form = first_form(observer, bounds, u)
+        first = FirstForm.of(observer, u)
         nothing = Domain.of(typed(bounds, y.dtype), size)
-        alone = _output(nothing, maps.states(bounds), form, known.z)
+        alone = _output(nothing, maps.states(bounds), first.on(bounds), known.z)
         domain = nothing.intersect(everything_unless(carry.starts, before)[None], Source.INITIAL)
-        domain = _output(domain, maps.states(domain.box), first_form(observer, domain.box, u), known.z)
+        domain = _output(domain, maps.states(domain.box), first.on(domain.box), known.z)
         lost = Lost(observer, d_fixed)
         domain = initial_boxes(maps, domain, right, lost.inputs, u)
         # What the gains leave of x[k] and d[k-1]: smaller boxes to come can only make it smaller.
@@ -118,12 +108,12 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
 
     # 4. Sweeps: T2 g on the box so far, every row solved for every state, and (*) solved for x[k].
     with _stage("sweeps"):
-        states, psi = maps.states(domain.box), Affine(form.slope - observer.C, form.center, form.radius)
+        states = maps.states(domain.box)
         covered = set(observer.first.linear) >= set(range(observer.gains.residual.shape[0]))
         for sweep in range(observer.sweeps):
             rows = None
             if sweep == 0 or observer.first.affine_output:
-                form = first_form(observer, domain.box, u)
+                form = first.on(domain.box)
                 psi = Affine(form.slope - observer.C, form.center, form.radius)
                 if sweep == 0 and covered and not observer.first.affine_output:
                     continue  # the initial contraction was this
@@ -215,10 +205,8 @@ def _limited(box: Interval) -> Interval:
 
 def _current_input(maps: Maps, states: States, h: AtomBounds, output: Interval, believed: Any) -> Interval:
     """Box of ``V1' d = current (y - g - D u - v)``, slopes combined before the box is applied (paper, Lemma 4)."""
-    current, n = maps.observer.current, maps.observer.system.n
-    xp = np if is_concrete(current) else jnp
-    weights = xp.concatenate([xp.zeros((current.shape[0], n)), -current], 1)
-    found = maps.rows(weights).bounds(states, h)
-    seen = plain_image(current, widened(output, output.shape[0]))
+    current = maps.observer.current
+    found = maps.rows(maps.on_outputs(-current)).bounds(states, h)
+    seen = plain_image(current, widened_for_sums(output, output.shape[0]))
     now = Interval.unchecked(found.lower + seen.lower, found.upper + seen.upper)
     return everything_unless(believed, nan_to_unbounded(now))

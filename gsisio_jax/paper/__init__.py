@@ -22,7 +22,7 @@ from gsisio_jax.design.abstraction import affine_abstraction
 from gsisio_jax.design.framer import FramerGains, framer_gains
 from gsisio_jax.inclusion.intersection import bound
 from gsisio_jax.inclusion.mixed_monotone import decomposition, decomposition_function
-from gsisio_jax.interval.box import linear_image
+from gsisio_jax.interval.image import linear_image
 from gsisio_jax.paper import example, figures
 from gsisio_jax.paper.algorithm import Gsisio, gsisio
 from gsisio_jax.paper.lipschitz import PRINTED, LipschitzConstants, lipschitz_constants

@@ -14,6 +14,8 @@ import jax
 import jax.extend.core as jex
 import numpy as np
 
+from gsisio_jax.scalar.unroll import called_jaxpr
+
 _CALLS = {
     "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call",
     "custom_vjp_call_jaxpr",
@@ -71,7 +73,7 @@ class _Program:
         for eqn in jaxpr.eqns:
             operands = [of(atom) for atom in eqn.invars]
             if eqn.primitive.name in _CALLS:
-                found = self.add(*_body(eqn), operands)
+                found = self.add(*called_jaxpr(eqn), operands)
             else:
                 found = self._append(_operation(eqn), operands, len(eqn.outvars))
             places.update(zip(eqn.outvars, found, strict=True))
@@ -84,11 +86,6 @@ class _Program:
         found = [self.place() for _ in range(count)]
         self.operations.append((operation, operands, found))
         return found
-
-
-def _body(eqn: Any) -> tuple[Any, Sequence[Any]]:
-    inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
-    return (inner.jaxpr, inner.consts) if isinstance(inner, jex.ClosedJaxpr) else (inner, ())
 
 
 def _operation(eqn: Any) -> Callable[..., Sequence[Any]]:

@@ -84,7 +84,7 @@ def evaluate(graph: Graph, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any
 def _result(graph: Graph, eqn: Any, args: list[Any], stage: str) -> Sequence[Any]:
     name = eqn.primitive.name
     if name in _CALLS:
-        return evaluate(graph, *_body(eqn), args, stage)
+        return evaluate(graph, *called_jaxpr(eqn), args, stage)
     graph.stage = stage
     if name in _MOVES:
         return _MOVES[name](eqn, *args)
@@ -111,15 +111,22 @@ def _bound(eqn: Any, args: Sequence[Any]) -> Sequence[Any]:
     given = dict(zip(map(id, eqn.invars), args, strict=True))
     first = {id(atom): atom for atom in eqn.invars if not isinstance(atom, jex.Literal)}
     names, results = ("",) * len(first), ("",) * len(eqn.outvars)
-    info = _body(eqn)[0].debug_info._replace(arg_names=names, result_paths=results)
+    info = called_jaxpr(eqn)[0].debug_info._replace(arg_names=names, result_paths=results)
     alone = jex.Jaxpr((), list(first.values()), eqn.outvars, [eqn], eqn.effects, info)
     return jex.jaxpr_as_fun(jex.ClosedJaxpr(alone, ()))(*(given[key] for key in first))
 
 
-def _body(eqn: Any) -> tuple[Any, Sequence[Any]]:
-    """The jaxpr that a call runs; its parameter's name moves between primitives and JAX versions."""
-    inner = next(eqn.params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in eqn.params)
-    return (inner.jaxpr, inner.consts) if isinstance(inner, jex.ClosedJaxpr) else (inner, ())
+def called_jaxpr(eqn: Any) -> tuple[Any, Sequence[Any]]:
+    """The jaxpr that a call runs, and its constants; its parameter's name moves between primitives and JAX versions.
+
+    Raises:
+        LookupError: the equation has none of these parameters.
+    """
+    for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"):
+        if key in eqn.params:
+            inner = eqn.params[key]
+            return (inner.jaxpr, inner.consts) if isinstance(inner, jex.ClosedJaxpr) else (inner, ())
+    raise LookupError(f"{eqn.primitive.name} has no body")
 
 
 def _parts(graph: Graph, eqn: Any, args: Sequence[Any]) -> list[Any]:

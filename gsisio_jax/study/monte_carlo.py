@@ -16,7 +16,8 @@ from gsisio_jax.observer import checks
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.estimation import OnConflict
 from gsisio_jax.plant.system import Noise
-from gsisio_jax.study.axes import RUN, Axis, Layout, prepare
+from gsisio_jax.study.arguments import prepare
+from gsisio_jax.study.axes import RUN, Axis, Layout
 from gsisio_jax.study.containment import Containment, TrueRun
 from gsisio_jax.study.job import Job
 from gsisio_jax.study.labels import Labels

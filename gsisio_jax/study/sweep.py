@@ -12,7 +12,8 @@ from gsisio_jax.observer import checks
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.estimation import OnConflict
 from gsisio_jax.plant.system import Noise
-from gsisio_jax.study.axes import Axis, Layout, bare, prepare
+from gsisio_jax.study.arguments import prepare
+from gsisio_jax.study.axes import Axis, Layout, bare
 from gsisio_jax.study.job import Job
 from gsisio_jax.study.labels import Labels
 from gsisio_jax.study.reductions import resolve

@@ -15,7 +15,7 @@ from gsisio_jax.design.basic_inverses import basic_left_inverses, circuits
 from gsisio_jax.design.framer import framer_gains
 from gsisio_jax.design.left_inverse import smallest_radius_inverse
 from gsisio_jax.examples import paper
-from gsisio_jax.interval.box import image
+from gsisio_jax.interval.image import image
 
 _ROWS, _INPUTS, _LINES = 56, 3, 8  # of the padded stack: C(8, 3) supports at most
 

@@ -8,8 +8,11 @@ import mpmath as mp
 import numpy as np
 import pytest
 
+from gsisio_jax.inclusion.atom_bounds import BoxOfAtoms
+from gsisio_jax.inclusion.atom_forms import from_node
+from gsisio_jax.inclusion.atom_values import rule
 from gsisio_jax.inclusion.atoms import Rows, States
-from gsisio_jax.inclusion.expansion import Expansion, InputBox, _from_node, _rule
+from gsisio_jax.inclusion.expansion import Expansion
 from gsisio_jax.inclusion.reader import expand
 from gsisio_jax.inclusion.rules.sincos import LIMIT, SLOT, half_sin_cos, sin_cos
 from gsisio_jax.inclusion.rules.trig import wave_atom, wave_point
@@ -207,15 +210,14 @@ def test_no_wider_than_by_the_rules_of_the_engine():
     def both(lower, upper):
         with rounding.using("outward"):
             states = States.of(Interval.unchecked(lower, upper), found.terms)
-            domain = InputBox(states.wide.lower, states.wide.upper, states.magnitude)
-            new, old = [], []
+            box, old = BoxOfAtoms(states, None, found.terms), []
             for atom in found.atoms:
-                arguments = [found._argument(t, states, new) for t in atom.arguments]
-                old.append(_from_node(_rule(atom, [t.node(domain) for t in arguments]), states, found.terms))
-                new.append(found._bounded(atom, states, None, new, domain, {}))
+                arguments = [box.argument(t) for t in atom.arguments]
+                old.append(from_node(rule(atom, [t.node(box.domain) for t in arguments]), states, found.terms))
+                box.add(atom, True)
             return [
                 [(jnp.stack([jnp.asarray(s) for s in b.slope]), b.radius, b.range.lower, b.range.upper) for b in bounds]
-                for bounds in (new, old)
+                for bounds in (box.found, old)
             ]
 
     new, old = jax.tree.map(np.asarray, both(lower, upper))

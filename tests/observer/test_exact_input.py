@@ -9,7 +9,7 @@ from oracles.input_hull import feasibility_slack, input_hull
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from gsisio_jax.interval.box import image
+from gsisio_jax.interval.image import image
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.input_boxes import exact_input
 

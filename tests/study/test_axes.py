@@ -7,7 +7,7 @@ import pytest
 
 import gsisio_jax as gx
 from gsisio_jax.study import Layout, Truth
-from gsisio_jax.study.axes import prepare
+from gsisio_jax.study.arguments import prepare
 
 T = 5
 

@@ -12,13 +12,13 @@ import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import (
     added_slack,
+    box_sum,
     product,
+    scaled,
     scaled_slack,
-    shift,
-    stretch,
     sum_slack,
 )
-from gsisio_jax.inclusion.node import Node, as_node, best_form, chain, is_node, join, meet, parts, settled, slope_of
+from gsisio_jax.inclusion.node import Node, as_node, best_form, chain, is_node, join, meet, normalised, parts, slope_of
 from gsisio_jax.inclusion.rules.functions import CURVES, RECIPROCAL, SQUARE, power
 from gsisio_jax.inclusion.rules.linear import add, move, multiple, structural, total
 from gsisio_jax.inclusion.rules.univariate import apply, extremes
@@ -34,7 +34,7 @@ def multiply(x: Any, y: Any) -> Node:
         return multiple(x, y)
     if not is_node(y):
         return multiple(y, x)
-    x, y = settled(x), settled(y)
+    x, y = normalised(x), normalised(y)
     natural = product(x.range, y.range)
     box, _ = parts([x, y])
     form = None
@@ -62,7 +62,7 @@ def bilinear_line(x: Interval, y: Interval, kappa: float) -> tuple[Any, Any, Any
     r, s = times(x.upper, y.lower), times(x.upper, y.upper)
     lower, upper = smaller(smaller(p, q), smaller(r, s)), larger(larger(p, q), larger(r, s))
     lower, upper = (
-        rounding.unbounded(move(side, 2.0 + kappa, 2.0**60), end)
+        rounding.unbounded(move(side, 2.0 + kappa, rounding.FLUSHED), end)
         for side, move, end in ((lower, rounding.down, -jnp.inf), (upper, rounding.up, jnp.inf))
     )
     largest = float(jnp.finfo(p.dtype).max) / 8
@@ -84,7 +84,7 @@ def _envelope(x: Node, y: Node, cx: Any, cy: Any, spread: Any, natural: Interval
     """The form of a product: both factors' forms weighed with the centers, and `spread`."""
     slope, slack = _weighed([(cy, x), (cx, y)], box)
     with rounding.using("nearest"):
-        a, b = stretch(cy, x.offset), stretch(cx, y.offset)
+        a, b = scaled(cy, x.offset), scaled(cx, y.offset)
     lower = a.lower + b.lower - cx * cy - spread
     upper = a.upper + b.upper - cx * cy + spread
     # Five roundings at most pass through any of these terms.
@@ -137,7 +137,7 @@ def raise_to(x: Any, p: Any) -> Node:
     if not is_node(p) and is_concrete(p) and np.size(p) > 0 and (np.asarray(p) == np.ravel(p)[0]).all():
         return integer_power(x, float(np.ravel(p)[0]))
     log, exp = CURVES["log"], CURVES["exp"]
-    x, p = settled(x), settled(p)
+    x, p = normalised(x), normalised(p)
     if not is_node(x):
         good = jnp.asarray(x) > 0
         base = as_node(jnp.where(good, x, 1), p.shape, p.dtype)
@@ -213,7 +213,7 @@ def angle(y: Any, x: Any) -> Node:
     taken off: its extremes lie on the edges of the rectangle, where they are known in closed form.
     """
     shape, dtype = (y.shape, y.dtype) if is_node(y) else (x.shape, x.dtype)
-    y, x = (settled(v) if is_node(v) else as_node(v, shape, dtype) for v in (y, x))
+    y, x = (normalised(v) if is_node(v) else as_node(v, shape, dtype) for v in (y, x))
     yl, yu, xl, xu = y.range.lower, y.range.upper, x.range.lower, x.range.upper
     cut = (xl < 0) & (yl < 0) & (yu >= 0)
     corners = extremes([_angle_at(b, a) for a in (xl, xu) for b in (yl, yu)])
@@ -245,10 +245,10 @@ def angle(y: Any, x: Any) -> Node:
         rest = Interval.unchecked(
             rounding.lowered(rest.lower, size, 4 * ANGLE_ULPS), rounding.raised(rest.upper, size, 4 * ANGLE_ULPS)
         )
-        linear = shift(stretch(sy, y.offset), stretch(sx, x.offset))
+        linear = box_sum(scaled(sy, y.offset), scaled(sx, x.offset))
         slope, slack = _weighed([(sy, y), (sx, x)], box)
         slack = None if slack is None else jnp.where(finite, slack, 0)
-        offset = choose(finite, shift(linear, rest), natural)
+        offset = choose(finite, box_sum(linear, rest), natural)
         form = best_form(jnp.where(finite, slope, 0), offset, natural, box, slack, size)
     if jac is None:
         return Node(natural, form)

@@ -12,7 +12,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from gsisio_jax.inclusion.form_arithmetic import shift, slope_image, sum_slack
+from gsisio_jax.inclusion.form_arithmetic import box_sum, slope_image, sum_slack
 from gsisio_jax.inclusion.node import (
     POINT_MODE,
     Form,
@@ -24,8 +24,8 @@ from gsisio_jax.inclusion.node import (
     jac_of,
     join,
     meet,
+    normalised,
     parts,
-    settled,
     slack_of,
     slope_of,
 )
@@ -56,13 +56,13 @@ def compare(certain: Callable[[Any, Any], Any], possible: Callable[[Any, Any], A
     def rule(x: Any, y: Any) -> Node:
         shape = jnp.broadcast_shapes(jnp.shape(_low(x)), jnp.shape(_low(y)))
         dtype = x.dtype if is_node(x) else y.dtype
-        nodes = [settled(v) if is_node(v) else as_node(v, shape, dtype) for v in (x, y)]
+        nodes = [normalised(v) if is_node(v) else as_node(v, shape, dtype) for v in (x, y)]
         a, b = nodes[0].range, nodes[1].range
         if a.lower.dtype == bool:
             return step(Interval.unchecked(certain(a.upper, b.lower), possible(a.lower, b.upper)), [x, y])
         sure, maybe = certain(a.upper, b.lower), possible(a.lower, b.upper)
         if all(v.form is not None for v in nodes):
-            gap = settled(subtract(*nodes)).range
+            gap = normalised(subtract(*nodes)).range
             sure |= certain(gap.upper, jnp.zeros_like(gap.upper))
             maybe &= possible(gap.lower, jnp.zeros_like(gap.lower))
         return step(Interval.unchecked(sure, sure | maybe), [x, y])
@@ -116,7 +116,7 @@ def staircase(fn: Callable[[Any], Any], below: float, above: float) -> Callable[
     """Rule for rounding: ``fn`` is nondecreasing and ``fn(t) - t`` lies in ``[below, above]``."""
 
     def rule(x: Node) -> Node:
-        x = settled(x)
+        x = normalised(x)
         natural = Interval.unchecked(fn(x.range.lower), fn(x.range.upper))
         node = step(natural, [x])
         if x.form is None or POINT_MODE.get():
@@ -139,9 +139,9 @@ def sign(x: Node) -> Node:
 def _remainder(rounding: Callable[[Any], Any], x: Any, y: Any) -> Node:
     """``x - y k`` with k the rounded quotient; linear where k is one number on the whole box."""
     shape, dtype = (x.shape, x.dtype) if is_node(x) else (y.shape, y.dtype)
-    x, y = settled(x), settled(y)
+    x, y = normalised(x), normalised(y)
     a, b = (v.range if is_node(v) else as_node(v, shape, dtype).range for v in (x, y))
-    quotient = settled(divide(x, y)).range
+    quotient = normalised(divide(x, y)).range
     low, high = rounding(quotient.lower), rounding(quotient.upper)
     known = (low == high) & jnp.isfinite(low)
     count = jnp.where(known, low, 0)
@@ -169,7 +169,7 @@ def log_add_exp(x: Any, y: Any) -> Node:
     """``log(exp x + exp y)``: smooth, so without the kink of the maximum that its body starts from."""
     if not is_node(x):
         x, y = y, x
-    x, y = settled(x), settled(y) if is_node(y) else as_node(y, x.shape, x.dtype)
+    x, y = normalised(x), normalised(y) if is_node(y) else as_node(y, x.shape, x.dtype)
     low, high = x.range.lower, x.range.upper
     first, last = _log_add_exp(low, y.range.lower), _log_add_exp(high, y.range.upper)
     # max(x, y) + log1p(exp(-|x - y|)): the sum may cancel, so its error goes with the two terms.
@@ -181,7 +181,7 @@ def log_add_exp(x: Any, y: Any) -> Node:
     total = add(bend, Node(y.range, y.form))
     form = total.form
     form = form and best_form(form.slope, form.offset, natural, form.box, form.slack)
-    gap = settled(subtract(Node(x.range, x.form), Node(y.range, y.form))).range
+    gap = normalised(subtract(Node(x.range, x.form), Node(y.range, y.form))).range
     share = SOFTPLUS.derivative(gap.lower, gap.upper)
     rest = Interval.unchecked(
         jnp.maximum(rounding.lowered(1 - share.upper, jnp.ones_like(share.upper), 2.0), 0),
@@ -202,11 +202,11 @@ def maximum(x: Any, y: Any) -> Node:
         x, y = y, x
     if not is_node(y):
         y = as_node(y, x.shape, x.dtype)
-    x, y = settled(x), settled(y)
+    x, y = normalised(x), normalised(y)
     a, b = x.range, y.range
     natural = Interval.unchecked(larger(a.lower, b.lower), larger(a.upper, b.upper))
     box, jac = parts([x, y])
-    gap = settled(subtract(Node(x.range, x.form), Node(y.range, y.form)))
+    gap = normalised(subtract(Node(x.range, x.form), Node(y.range, y.form)))
     first, second = gap.range.lower >= 0, gap.range.upper <= 0
     form = None
     if box is not None:
@@ -251,7 +251,7 @@ def select(which: Any, *cases: Any) -> Any:
         single = [(low == i) & (high == i) for i in range(len(cases))]
     shape = next((v.shape for v in cases if is_node(v)), jnp.shape(cases[0]))
     typed = jnp.result_type(*([v.dtype for v in cases if is_node(v)] or cases))
-    nodes = [settled(v) if is_node(v) else as_node(v, shape, typed) for v in cases]
+    nodes = [normalised(v) if is_node(v) else as_node(v, shape, typed) for v in cases]
     if nodes[0].range.lower.dtype == bool:
         lower = jnp.stack([~p | v.range.lower for p, v in zip(possible, nodes, strict=True)]).all(0)
         upper = jnp.stack([p & v.range.upper for p, v in zip(possible, nodes, strict=True)]).any(0)
@@ -266,7 +266,7 @@ def select(which: Any, *cases: Any) -> Any:
         slope = sum(slopes[1:], slopes[0]) / len(slopes)
         for mask, own in zip(single, slopes, strict=True):
             slope = jnp.where(mask, own, slope)
-        offsets = [shift(v.offset, slope_image(own - slope, box)) for v, own in zip(nodes, slopes, strict=True)]
+        offsets = [box_sum(v.offset, slope_image(own - slope, box)) for v, own in zip(nodes, slopes, strict=True)]
         slack = None
         if rounding.outward():
             # What every case lost; the rounding of ``own - slope`` is in the image above.

@@ -16,14 +16,14 @@ import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import (
     added_slack,
+    box_sum,
     fold,
     is_known,
     is_point,
     known_if_concrete,
     product,
+    scaled,
     scaled_slack,
-    shift,
-    stretch,
     sum_slack,
 )
 from gsisio_jax.inclusion.node import (
@@ -36,12 +36,12 @@ from gsisio_jax.inclusion.node import (
     jac_of,
     join,
     meet,
+    normalised,
     parts,
-    settled,
     slack_of,
     slope_of,
     sparse,
-    unsettled,
+    unnormalised_node,
 )
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, is_concrete
@@ -140,20 +140,20 @@ def multiple(factor: Any, x: Node, rounded: bool = False) -> Node:
     if is_known(factor) and ((factor != 0) & (np.abs(factor) < np.finfo(x.dtype).tiny)).any():
         # Compiled code would take it for zero: a thin box, without form.
         thin = as_node(factor, np.broadcast_shapes(np.shape(factor), x.shape), x.dtype).range
-        x = settled(x)
+        x = normalised(x)
         return Node(product(thin, x.range), None, chain(thin, x.jac))
     ulps = 4.0 if rounded else 2.0
     if not (is_known(factor) and np.isfinite(factor).all()):
-        x = settled(x)  # 0 times NaN would count as 0
-    form, jac = x.form, None if x.jac is None else sparse(stretch(factor, x.jac, ulps), x.jac)
+        x = normalised(x)  # 0 times NaN would count as 0
+    form, jac = x.form, None if x.jac is None else sparse(scaled(factor, x.jac, ulps), x.jac)
     if form is not None:
         slope = factor * form.slope
         slack = scaled_slack(factor, form.slope, slope, form.slack, ulps)
-        form = Form(slope, stretch(factor, form.offset, ulps), form.box, slack)
+        form = Form(slope, scaled(factor, form.offset, ulps), form.box, slack)
         if form.is_static_affine():
-            return unsettled(None, form, jac)
+            return unnormalised_node(None, form, jac)
         form = None if POINT_MODE.get() else form
-    return unsettled(stretch(factor, x.range, ulps), form, jac)
+    return unnormalised_node(scaled(factor, x.range, ulps), form, jac)
 
 
 def negative(x: Node) -> Node:
@@ -176,16 +176,16 @@ def add(x: Any, y: Any) -> Node:
     form, jac = x.form if y.form is None else y.form, join(x.jac, y.jac)
     if form is not None and x.is_static_affine and y.is_static_affine:
         return _known_sum(x, y, form.box, jac)
-    total = shift(x.range, y.range)
+    total = box_sum(x.range, y.range)
     if form is None or POINT_MODE.get():
-        return unsettled(total, None, jac)
-    offset = shift(x.offset, y.offset)
+        return unnormalised_node(total, None, jac)
+    offset = box_sum(x.offset, y.offset)
     if x.form is None or y.form is None:
         # With one form only there is nothing to cancel, and the range is what it was, moved.
-        return unsettled(total, Form(form.slope, offset, form.box, form.slack), jac)
+        return unnormalised_node(total, Form(form.slope, offset, form.box, form.slack), jac)
     slope = x.form.slope + y.form.slope
     slack = sum_slack(x.form.slack, y.form.slack, added_slack(x.form.slope, y.form.slope, slope))
-    return meet(unsettled(total, Form(slope, offset, form.box, slack), jac))
+    return meet(unnormalised_node(total, Form(slope, offset, form.box, slack), jac))
 
 
 def _known_sum(x: Node, y: Node, box: Any, jac: Any) -> Node:
@@ -193,10 +193,10 @@ def _known_sum(x: Node, y: Node, box: Any, jac: Any) -> Node:
     a, b = (slope_of(v, box) for v in (x, y))
     slope = a + b
     slack = sum_slack(*(v.form.slack for v in (x, y) if v.form is not None), added_slack(a, b, slope))
-    offset = shift(
+    offset = box_sum(
         *(Interval.unchecked(*(np.broadcast_to(side, slope.shape[1:]) for side in _sides(v.offset))) for v in (x, y))
     )
-    return unsettled(None, Form(slope, offset, box, slack), jac)
+    return unnormalised_node(None, Form(slope, offset, box, slack), jac)
 
 
 def _sides(a: Interval) -> tuple[Any, Any]:

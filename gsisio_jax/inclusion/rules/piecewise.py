@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from gsisio_jax.inclusion.form_arithmetic import shift, slope_image
+from gsisio_jax.inclusion.form_arithmetic import box_sum, slope_image
 from gsisio_jax.inclusion.node import (
     Form,
     Node,
@@ -37,8 +37,8 @@ from gsisio_jax.inclusion.node import (
     best_form,
     is_node,
     jac_of,
+    normalised,
     parts,
-    settled,
     slack_of,
     slope_of,
 )
@@ -81,6 +81,7 @@ def by_pieces(eqn: Any, args: Sequence[Any], plain: Node, apply: Apply, elementw
         again = partial(Again, apply, None if single else elementwise)
         jumps = [_jump(eqn, args, again, switch, i) for i in range(len(switch.cuts))]
         cases = [_on_segment(eqn, args, again, switch, i, plain) for i in range(len(switch.between))]
+        cases += [_at_cut(eqn, args, again, switch, i, plain) for i in range(len(switch.cuts)) if _alone(switch, i)]
     except NotAgain:
         return plain
     finally:
@@ -96,8 +97,15 @@ def _value(switch: Switch, value: Any) -> np.ndarray:
     return np.full(switch.node.shape, value, switch.node.dtype)
 
 
-def _jump(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int) -> tuple[Any, Any]:
-    """Bound of the differences between the values at cut i and just below and above it, and of the size of these."""
+class _Jump(NamedTuple):
+    """Differences between the value at a cut and those just below and above it, and the size of the value."""
+
+    below: Any
+    above: Any
+    size: Any
+
+
+def _jump(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int) -> _Jump:
     pivot = switch.pivot
     cut = np.broadcast_to(switch.cuts[i], pivot.shape).astype(pivot.dtype)
     thin = Node(Interval.unchecked(cut, cut))
@@ -107,12 +115,12 @@ def _jump(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: 
         for value in (switch.at[i], switch.between[i], switch.between[i + 1]):
             found = again([(pivot, thin), (switch.node, _value(switch, value))]).equation(eqn, args)
             dtype = eqn.outvars[0].aval.dtype
-            values.append(settled(found) if is_node(found) else as_node(found, eqn.outvars[0].aval.shape, dtype))
-        gaps = [settled(subtract(values[0], other)).range for other in values[1:]]
-        jump = jnp.maximum(*(jnp.maximum(abs(gap.lower), abs(gap.upper)) for gap in gaps))
+            values.append(normalised(found) if is_node(found) else as_node(found, eqn.outvars[0].aval.shape, dtype))
+        gaps = [normalised(subtract(values[0], other)).range for other in values[1:]]
+        jumps = [jnp.maximum(abs(gap.lower), abs(gap.upper)) for gap in gaps]
         size = jnp.maximum(abs(values[0].range.lower), abs(values[0].range.upper))
-        jump = jnp.where(jnp.isnan(jump), jnp.inf, jump)
-        return (np.asarray(jump), np.asarray(size)) if known else (jump, size)
+        parts_of = [*(jnp.where(jnp.isnan(jump), jnp.inf, jump) for jump in jumps), size]
+        return _Jump(*(map(np.asarray, parts_of) if known else parts_of))
 
 
 def _only_constants(args: Sequence[Any], pivot: Node) -> bool:
@@ -144,19 +152,40 @@ class _Case(NamedTuple):
 def _on_segment(
     eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int, plain: Node
 ) -> _Case:
-    pivot, cuts = settled(switch.pivot), switch.cuts
+    pivot, cuts = normalised(switch.pivot), switch.cuts
     low, high = pivot.range.lower, pivot.range.upper
     first = low if i == 0 else larger(low, jnp.asarray(cuts[i - 1], low.dtype))
     last = high if i == len(cuts) else smaller(high, jnp.asarray(cuts[i], low.dtype))
-    possible = first <= last
+    # A segment that only touches the range counts where it owns the point, as nothing else does then.
+    owned = jnp.ones_like(first, bool)
+    for j in (i - 1, i):
+        if 0 <= j < len(cuts):
+            owned &= (first != cuts[j]) | (switch.at[j] == switch.between[i])
+    possible = (first < last) | ((first == last) & owned)
     # Where the segment is out of reach anything will do: the cut itself.
     stand_in = jnp.asarray(cuts[min(i, len(cuts) - 1)], low.dtype)
     box = choose(possible, Interval.unchecked(first, last), Interval.unchecked(stand_in, stand_in))
     cut_down = Node(box, _loose(pivot.form), pivot.jac)
     replaced = [(switch.pivot, cut_down), (switch.node, _value(switch, switch.between[i]))]
     found = again(replaced).equation(eqn, args)
-    node = settled(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
+    node = normalised(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
     return _Case(jnp.broadcast_to(possible, plain.shape), box, node)
+
+
+def _alone(switch: Switch, i: int) -> bool:
+    """The value at the cut is that of neither neighbour, as with the sign of 0."""
+    return switch.at[i] not in (switch.between[i], switch.between[i + 1])
+
+
+def _at_cut(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int, plain: Node) -> _Case:
+    pivot = normalised(switch.pivot)
+    cut = jnp.broadcast_to(jnp.asarray(switch.cuts[i], pivot.dtype), pivot.shape)
+    possible = (pivot.range.lower <= cut) & (cut <= pivot.range.upper)
+    thin = Interval.unchecked(cut, cut)
+    replaced = [(switch.pivot, Node(thin, _loose(pivot.form), pivot.jac)), (switch.node, _value(switch, switch.at[i]))]
+    found = again(replaced).equation(eqn, args)
+    node = normalised(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
+    return _Case(jnp.broadcast_to(possible, plain.shape), thin, node)
 
 
 def _loose(form: Form | None) -> Form | None:
@@ -167,11 +196,11 @@ def _loose(form: Form | None) -> Form | None:
     return Form(jnp.asarray(form.slope), offset, form.box, form.slack)
 
 
-def _hull(plain: Node, switch: Switch, cases: Sequence[_Case], jumps: Sequence[tuple[Any, Any]]) -> Node:
-    pivot = settled(switch.pivot)
+def _hull(plain: Node, switch: Switch, cases: Sequence[_Case], jumps: Sequence[_Jump]) -> Node:
+    pivot = normalised(switch.pivot)
     tolerance = max(_CONTINUOUS, 64 * float(jnp.finfo(plain.dtype).eps))
-    small = [jump <= tolerance * jnp.maximum(size, 1) for jump, size in jumps]
-    slip = sum(jnp.where(ok, jump, 0) for ok, (jump, _) in zip(small, jumps, strict=True))
+    small = [[jump <= tolerance * jnp.maximum(j.size, 1) for jump in (j.below, j.above)] for j in jumps]
+    slip = sum(jnp.where(ok[0], j.below, 0) + jnp.where(ok[1], j.above, 0) for ok, j in zip(small, jumps, strict=True))
     natural = _met(_hull_of([(case.possible, case.node.range) for case in cases]), plain.range)
     extra = rounding.generous(2 * slip) if rounding.outward() else 2 * slip
     natural = Interval.unchecked(natural.lower - extra, natural.upper + extra)
@@ -183,9 +212,11 @@ def _hull(plain: Node, switch: Switch, cases: Sequence[_Case], jumps: Sequence[t
     if jac is not None:
         size = jac.lower.shape[0]
         jac = _hull_of([(case.possible, jac_of(case.node, size)) for case in cases])
-        for ok, cut in zip(small, switch.cuts, strict=True):
-            inside = (pivot.range.lower <= cut) & (pivot.range.upper >= cut)
-            jac = choose(jnp.broadcast_to(~inside | ok, jac.lower.shape), jac, entire_like(jac.lower))
+        cuts = switch.cuts if pivot.jac is not None else ()  # what does not depend on x does not jump in x
+        low, high = pivot.range.lower, pivot.range.upper
+        for ok, cut in zip(small, cuts, strict=False):
+            smooth = (~((low < cut) & (cut <= high)) | ok[0]) & (~((low <= cut) & (cut < high)) | ok[1])
+            jac = choose(jnp.broadcast_to(smooth, jac.lower.shape), jac, entire_like(jac.lower))
     return Node(natural, form, jac)
 
 
@@ -209,7 +240,7 @@ def _common_form(pivot: Node, cases: Sequence[_Case], natural: Interval, extra: 
     is the slope of the chord. What a piece has more or less of it goes to the offset, as a multiple of p where it is
     one: p is known better on a segment than x is."""
     slopes = [slope_of(case.node, box) for case in cases]
-    slope = sum(times(share, own) for share, own in zip(_shares(cases), slopes, strict=True))
+    slope = jnp.stack([times(share, own) for share, own in zip(_shares(cases), slopes, strict=True)]).sum(0)
     along = slope_of(pivot, box)
     length = (along * along).sum(0)
     slack = sum((slack_of(case.node, own) for case, own in zip(cases, slopes, strict=True)), jnp.zeros_like(slope))
@@ -226,14 +257,14 @@ def _common_form(pivot: Node, cases: Sequence[_Case], natural: Interval, extra: 
         exact &= (along == 0) | ((abs(along) == 1) & (left == 0))
         lost = jnp.where(exact, 0, lost)
         slack = slack + jax.lax.stop_gradient(lost) + abs(part) * slack_of(pivot, along)
-        moved = shift(case.pivot, Interval.unchecked(-pivot.offset.upper, -pivot.offset.lower))
+        moved = box_sum(case.pivot, Interval.unchecked(-pivot.offset.upper, -pivot.offset.lower))
         up = part >= 0
         scaled = Interval.unchecked(
             rounding.down(times(part, jnp.where(up, moved.lower, moved.upper))),
             rounding.up(times(part, jnp.where(up, moved.upper, moved.lower))),
         )
         scaled = choose(part == 0, Interval.unchecked(0 * part, 0 * part), scaled)
-        offset = shift(shift(case.node.offset, slope_image(left, box)), scaled)
+        offset = box_sum(box_sum(case.node.offset, slope_image(left, box)), scaled)
         offsets.append((case.possible, Interval.unchecked(offset.lower - extra, offset.upper + extra)))
     return best_form(slope, _hull_of(offsets), natural, box, slack if rounding.outward() else None)
 

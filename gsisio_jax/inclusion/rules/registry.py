@@ -15,7 +15,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.node import Node, is_node, settled
+from gsisio_jax.inclusion.node import Node, is_node, normalised
 from gsisio_jax.inclusion.rules import bilinear, comparison, functions, linear, univariate
 from gsisio_jax.interval.box import Interval
 
@@ -105,7 +105,7 @@ def _to_floating(x: Any, target: Any) -> Any:
     """A node or a constant in that floating type."""
     if is_node(x) and jnp.issubdtype(x.dtype, jnp.floating) and jnp.finfo(target).bits < jnp.finfo(x.dtype).bits:
         # Bounds are those of the number before it is rounded to the narrower type, as for every other operation.
-        x = settled(x)
+        x = normalised(x)
         narrow = x.range.astype(target)
         jac = None if x.jac is None else x.jac.astype(target)
         return Node(narrow, None, jac)

@@ -152,7 +152,8 @@ def _joined(node: Node, a: Switch, b: Switch, rule: Callable[[Any, Any], Any]) -
             cuts.insert(place, cut)
 
     def value(switch: Switch, i: int, there: bool) -> Any:
-        below = sum((c <= cuts[i]).all() if there else (i > 0 and (c <= cuts[i - 1]).all()) for c in switch.cuts)
+        last = i if there else i - 1
+        below = sum(1 for c in switch.cuts if last >= 0 and (c <= cuts[last]).all())
         for c, at in zip(switch.cuts, switch.at, strict=True):
             if there and np.array_equal(c, cuts[i]):
                 return at

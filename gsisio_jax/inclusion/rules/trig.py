@@ -138,7 +138,7 @@ def wave_atom(cosine: bool, m: Any, r: Any, size: Any, terms: int) -> tuple[Any,
     everything = kind(1)
     if rounding.outward():
         ulps = 8 * SLOT + 3 * (2 * terms + 16)
-        pad = rounding.error(jax.lax.stop_gradient(size) + kind(cosine), ulps, 2.0**60)
+        pad = rounding.error(jax.lax.stop_gradient(size) + kind(cosine), ulps, rounding.FLUSHED)
         everything = kind(1 + ulps * float(jnp.finfo(m.dtype).eps))
     square = half_sin * half_sin
     slope, steep, turned, bent = steepness * half_cos, abs(steepness), 1 - 2 * square, value * square
@@ -146,10 +146,10 @@ def wave_atom(cosine: bool, m: Any, r: Any, size: Any, terms: int) -> tuple[Any,
     even = value * turned
     center = value - bent - slope * m  # halfway between value and even, which are 2 bent apart
     radius = abs(bent) + odd + pad
-    reach = 2 * steep * half_sin * half_cos + pad
+    half = 2 * steep * half_sin * half_cos + pad
     limit = turned - pad
-    lower = jnp.where(usable & (-value < limit), even - reach, -1)
-    upper = jnp.where(usable & (value < limit), even + reach, 1)
+    lower = jnp.where(usable & (-value < limit), even - half, -1)
+    upper = jnp.where(usable & (value < limit), even + half, 1)
     natural = Interval.unchecked(larger(lower, -1), smaller(upper, 1))
     middle = jnp.where(usable, value, 0), jnp.where(usable, pad, 1)
     slope, center = jnp.where(usable, slope, 0), jnp.where(usable, center, 0)
@@ -165,5 +165,5 @@ def wave_point(cosine: bool, t: Any, size: Any, terms: int) -> tuple[Any, Any]:
     pad: Any = kind(0)
     if rounding.outward():
         size = jax.lax.stop_gradient(jnp.where(usable, size, 0)) + kind(cosine)
-        pad = rounding.error(size, 8 * SLOT + 3 * (2 * terms + 16), 2.0**60)
+        pad = rounding.error(size, 8 * SLOT + 3 * (2 * terms + 16), rounding.FLUSHED)
     return value, jnp.where(usable, pad, 2)

@@ -1,0 +1,49 @@
+"""Casts between floating types, towards one side where the number does not fit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def cast_towards(value: Any, dtype: Any, towards: float) -> Any:
+    """Cast to `dtype`, towards -inf or inf where the number does not fit."""
+    dtype = jax.dtypes.canonicalize_dtype(dtype)
+    if value.dtype == dtype:
+        return jnp.asarray(value)
+    tiny = float(jnp.finfo(dtype).tiny)
+    if isinstance(value, np.ndarray | np.generic):
+        # On the host, before JAX sees the number: with 64-bit types off, JAX itself would round to nearest.
+        exact: Any = value
+        with np.errstate(all="ignore"):
+            cast = np.asarray(exact, dtype)
+            wrong = cast > exact if towards < 0 else cast < exact
+            moved = np.nextafter(cast, np.asarray(towards, dtype))
+            # Compiled code takes subnormal numbers for zero: they are no bounds.
+            moved = np.where(np.abs(moved) < tiny, np.copysign(tiny, towards), moved)
+            return jnp.asarray(np.where(wrong, moved, cast), dtype)
+    cast = value.astype(dtype)
+    if jnp.finfo(dtype).bits >= jnp.finfo(value.dtype).bits:
+        return cast
+    back = cast.astype(value.dtype)
+    wrong = back > value if towards < 0 else back < value
+    # nextafter has no derivative rule: add its step as a constant, so that gradients see a plain cast.
+    fixed = jax.lax.stop_gradient(cast)
+    step = jax.lax.stop_gradient(jnp.nextafter(fixed, jnp.asarray(towards, dtype)) - fixed)
+    largest = jnp.finfo(dtype).max if towards < 0 else jnp.finfo(dtype).min
+    moved = jnp.where(jnp.isfinite(fixed), cast + jnp.where(jnp.isfinite(step), step, 0), largest)
+    moved = jnp.where(abs(fixed) <= tiny, jnp.copysign(2 * tiny, towards), moved)
+    return jnp.where(wrong, moved, cast)
+
+
+def cast_down(value: Any, dtype: Any) -> Any:
+    """Cast to `dtype`, towards minus infinity where the number does not fit."""
+    return cast_towards(value, dtype, -np.inf)
+
+
+def cast_up(value: Any, dtype: Any) -> Any:
+    """Cast to `dtype`, towards infinity where the number does not fit."""
+    return cast_towards(value, dtype, np.inf)
