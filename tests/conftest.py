@@ -11,6 +11,15 @@ jax.config.update("jax_enable_x64", True)
 gc.set_threshold(100_000, 20, 50)
 
 
+# A file stays on one worker. These take longest; begun last (they have few tests), they would leave a core idle.
+LONGEST = ("test_containment.py", "test_tune_linear.py", "test_gradients.py", "test_readme.py", "test_missing.py",
+           "test_methods.py", "test_conflicts.py", "test_tune_scale.py")  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def little_memory() -> Iterator[None]:
     """No module needs the programs of another one; kept, they take gigabytes, and ever longer collections."""
