@@ -220,7 +220,10 @@ def maximum(x: Any, y: Any) -> Node:
     if jac is not None:
         size = jac.lower.shape[0]
         jx, jy = jac_of(x, size), jac_of(y, size)
-        jac = choose(gap.range.lower > 0, jx, choose(gap.range.upper < 0, jy, hull(jx, jy)))
+        # Where the gap ends at 0 every difference quotient is that of one side; at a point it may be any.
+        low, high = gap.range.lower, gap.range.upper
+        left, right = (low > 0) | ((low == 0) & (high > 0)), (high < 0) | ((high == 0) & (low < 0))
+        jac = choose(left, jx, choose(right, jy, hull(jx, jy)))
     return meet(Node(natural, form, jac))
 
 

@@ -149,9 +149,10 @@ class Hinge:
         return Interval.unchecked(jnp.where((a < 0) & (b > 0), 0, ends.lower), ends.upper)
 
     def derivative(self, a: Any, b: Any) -> Interval:
-        # At 0 itself the function has no derivative: the Clarke hull.
+        # The Clarke hull at 0 itself; on a box that ends there every difference quotient is that of its side.
         one = jnp.ones_like(a)
-        return Interval.unchecked(jnp.where(a > 0, one, self.left), jnp.where(b < 0, self.left * one, one))
+        right, left = (a > 0) | ((a == 0) & (b > 0)), (b < 0) | ((b == 0) & (a < 0))
+        return Interval.unchecked(jnp.where(right, one, self.left), jnp.where(left, self.left * one, one))
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
         low, high = jnp.isfinite(a), jnp.isfinite(b)
