@@ -58,9 +58,9 @@ def _types(args: Sequence[Any], program: ScalarProgram, levels: Levels) -> list[
         sizes.append(args[which].shape[-1 - sum(marks_[which] for marks_ in levels[:depth])])
     results = _result_levels(program, levels)
     types = []
-    for i, value in enumerate(program.outputs):
+    for i, dtype in enumerate(program.types):
         shape = tuple(size for size, out in zip(sizes[::-1], results[::-1], strict=True) if out[i])
-        types.append(jax.core.ShapedArray(shape, program.types[i]))
+        types.append(jax.core.ShapedArray(shape, dtype))
     return types
 
 
