@@ -43,7 +43,9 @@ def table(equations: dict[str, Any], operations: dict[str, Any], budget: dict[st
         lines.append(_line(program, "equations", row) + f"{most:>11}")
         if operations.get(program, row) != row:
             lines.append(_line("", "operations", operations[program]))
-    return "\n".join([*lines, "", "A gradient's equations are those of the step and of what its derivative adds."])
+    return "\n".join(
+        [*lines, "", "A gradient's equations are those of its way back, with what that computes again of the step."]
+    )
 
 
 def _line(program: str, of: str, row: dict[str, int]) -> str:

@@ -19,6 +19,7 @@ import systems
 from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.observer.step import advance, blank
 from gsisio_jax.scalar import ScalarProgram, scalar_program
+from gsisio_jax.scalar.derivative import cotangent_program, reached
 
 SYSTEMS = ("s1", "s5", "s7")
 VARIANTS = ("outward", "nearest", "with gradient")
@@ -46,20 +47,19 @@ class Step:
 
     def equations(self, variant: str) -> Counter[str]:
         """Equations of every stage in the jaxpr of the step, or in that of its gradient: of the widths of its box by
-        the noise bounds, old and new ones."""
+        the noise bounds, old and new ones. A gradient computes again what it needs of the step; in a scan the step
+        comes on top."""
         program = self.program(variant)
-
-        def widths(noise: Any) -> Any:
-            carry, y, u, _ = self._args
-            out = program(_entries((replace(carry, noise=noise), y, u, noise)))
-            n = carry.state.lower.size
-            return sum(out[n : 2 * n]) - sum(out[:n])
-
         if variant == "with gradient":
-            closed = jax.make_jaxpr(jax.grad(widths))(self._args[-1])
-        else:
-            closed = jax.make_jaxpr(program)(_entries(self._args))
-        return _equations(closed.jaxpr, "")
+            carry, _, _, _ = self._args
+            none = jax.tree.map(lambda leaf: jnp.zeros_like(leaf, bool), self._args)
+            every = jax.tree.map(lambda leaf: jnp.ones_like(leaf, bool), carry.noise)
+            moving = tuple(map(bool, _entries((replace(none[0], noise=every), *none[1:3], every))))
+            box = 2 * carry.state.lower.size
+            wanted = tuple(r and i < box for i, r in enumerate(reached(program, moving)))
+            back = cotangent_program(program, moving, wanted)
+            return _equations(jax.make_jaxpr(back)([jnp.zeros((), v.dtype) for v in back.inputs]).jaxpr, "")
+        return _equations(jax.make_jaxpr(program)(_entries(self._args)).jaxpr, "")
 
 
 def first_arguments(observer: Any, case: systems.Case) -> tuple[Any, Any, Any, Any]:

@@ -24,15 +24,20 @@ from gsisio_jax.interval.primitives import elementwise
 
 
 def _share(a: Any, b: Any) -> Any:
-    """Weight of the derivative of a in that of min(a, b): 1 where a is smaller, 0 where b is, 1/2 where they agree."""
+    """Weight of the derivative of a in that of min(a, b): 1 where a is smaller or b is NaN, 0 where b is smaller, 1/2
+    where they agree (but 1 where both are 0, or infinite)."""
     a, b = jax.lax.stop_gradient((a, b))
-    size = jnp.abs(a) + jnp.abs(b)
-    usual = (size > 0) & (size < jnp.inf)  # else both are 0, or one of them is infinite
-    steepness = 64 / float(jnp.finfo(size.dtype).eps) ** 0.5
-    part = jnp.where(usual, jnp.clip(0.5 * size + steepness * (b - a), 0, size), (a <= b).astype(size.dtype))
-    # The quotient comes last: XLA repeats cheap operations wherever their result is used, but no division. So all that
-    # use this weight use the same number, even where a and b are 0 but for rounding.
-    return part / jnp.where(usual, size, 1)
+    info = jnp.finfo(a.dtype)
+    # XLA repeats cheap operations wherever their result is used, but no division. So all that use this weight use the
+    # same quotient, even where a and b are 0 but for rounding. It is NaN where both are 0, or infinite, or b is NaN.
+    # The cap's inverse is a normal number: XLA divides by a constant by multiplying.
+    apart = (b - a) / jnp.minimum(jnp.abs(a), float(info.max) / 8)
+    share = 0.5 + apart * (32 / float(info.eps) ** 0.5)
+    return jnp.where(share < 1, jnp.maximum(share, 0), 1)
+
+
+def _larger_share(a: Any, b: Any) -> Any:
+    return _share(-a, -b)
 
 
 def _mix(share: Any, da: Any, db: Any) -> Any:
@@ -47,7 +52,7 @@ def _smaller_derivative(primals: Any, tangents: Any, out: Any) -> Any:
 
 
 def _larger_derivative(primals: Any, tangents: Any, out: Any) -> Any:
-    return _mix(_share(*primals[::-1]), *tangents)
+    return _mix(_larger_share(*primals), *tangents)
 
 
 smaller = elementwise("smaller", jax.lax.min, _smaller_derivative)
@@ -83,6 +88,10 @@ raised = elementwise("raised", _raised_body, _unless_nan(_larger_derivative))
 
 cut = elementwise("cut", _cut_body, _unless_nan(_smaller_derivative))
 """The smaller of an upper bound and another one, which is passed over where it is NaN (it overflowed)."""
+
+
+TIES = {"smaller": _share, "cut": _share, "larger": _larger_share, "raised": _larger_share}
+"""Weights of the derivative of the first argument, by name; what is left of 1 is that of the other one."""
 
 
 def smallest(values: Any, axis: int) -> Any:

@@ -63,11 +63,17 @@ def _alike(value: Any, shape: tuple[int, ...], dtype: Any) -> Any:
     return jnp.broadcast_to(jnp.asarray(value, dtype), shape)
 
 
-def _scale_derivative(primals: Any, tangents: Any, out: Any) -> Any:
+def _product_rule(partials: Callable[..., tuple[Any, Any]]) -> Callable[..., Any]:
+    def derivative(primals: Any, tangents: Any, out: Any) -> Any:
+        by_first, by_second = partials(*primals)
+        return tangents[0] * by_first + by_second * tangents[1]
+
+    return derivative
+
+
+def _scale_partials(factor: Any, value: Any) -> tuple[Any, Any]:
     # The product rule with the infinite values left out: a cotangent of 0 times inf would be NaN.
-    (factor, value), (d_factor, d_value) = primals, tangents
-    finite = jnp.where(jnp.isfinite(value), value, 0)
-    return d_factor * finite + factor * d_value
+    return jnp.where(jnp.isfinite(value), value, 0), factor
 
 
 def _scale_body(factor: Any, value: Any) -> Any:
@@ -75,7 +81,7 @@ def _scale_body(factor: Any, value: Any) -> Any:
     return jax.lax.select(jax.lax.eq(factor, zero), zero, jax.lax.mul(factor, value))
 
 
-scale = elementwise("scale", _scale_body, _scale_derivative)
+scale = elementwise("scale", _scale_body, _product_rule(_scale_partials))
 """``factor * value`` with ``0 * inf = 0``, for finite factors; finite gradients even where `value` is infinite."""
 
 
@@ -85,10 +91,9 @@ def moderate(dtype: Any) -> float:
     return float(info.max) * float(info.eps) ** 2
 
 
-def _times_derivative(primals: Any, tangents: Any, out: Any) -> Any:
-    (a, b), (da, db) = primals, tangents
+def _times_partials(a: Any, b: Any) -> tuple[Any, Any]:
     largest = moderate(a.dtype)
-    return jnp.where(jnp.abs(a) < largest, a, 0) * db + jnp.where(jnp.abs(b) < largest, b, 0) * da
+    return jnp.where(jnp.abs(b) < largest, b, 0), jnp.where(jnp.abs(a) < largest, a, 0)
 
 
 def _times_body(a: Any, b: Any) -> Any:
@@ -96,8 +101,12 @@ def _times_body(a: Any, b: Any) -> Any:
     return jax.lax.select(jax.lax.ne(product, product), jax.lax.full_like(product, 0), product)
 
 
-times = elementwise("times", _times_body, _times_derivative)
+times = elementwise("times", _times_body, _product_rule(_times_partials))
 """``a * b`` with ``0 * inf = 0`` for numbers of any size; its derivative treats a factor near infinity as 0."""
+
+
+PARTIALS = {"scale": _scale_partials, "times": _times_partials}
+"""Derivatives of products, by name, as functions of both factors."""
 
 
 def _divided(x: Any) -> Any:

@@ -9,6 +9,8 @@ gone. So the jaxpr of a step is unrolled:
     unroll    walks through a jaxpr; an array becomes a NumPy array of numbers
     scan      `jax.lax.scan` over such a program
     program   traces the numbers that are needed as `jax.lax` operations on 0-d values
+    derivative  tangents and cotangents of such a program, as programs of the same kind
+    primitive   a program as one equation of JAX, which knows its derivatives
 
 Gains that are concrete are constants here: zeros cost nothing, signs are known, magnitudes are computed while tracing.
 No simplification changes a bit of the result, but for the sign of a zero.

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import reduce
 from itertools import groupby
+from operator import or_
 from typing import Any
 
 import jax
@@ -29,7 +31,7 @@ _FREE = ("part", "stop_gradient", "wave", "falling_wave")  # of these nothing is
 _PLAIN = {
     "add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div, "neg": lax.neg, "abs": lax.abs, "max": lax.max,
     "min": lax.min, "eq": lax.eq, "select_n": lax.select_n, "and": lax.bitwise_and, "or": lax.bitwise_or,
-    "not": lax.bitwise_not, "stop_gradient": lax.stop_gradient,
+    "not": lax.bitwise_not, "sign": lax.sign, "stop_gradient": lax.stop_gradient,
     "scale": primitives.scale.primitive.bind, "times": primitives.times.primitive.bind,
     "smaller": minmax.smaller.primitive.bind, "larger": minmax.larger.primitive.bind,
     "raised": minmax.raised.primitive.bind, "cut": minmax.cut.primitive.bind,
@@ -40,18 +42,22 @@ class ScalarProgram:
     """A function of single numbers.
 
     Attributes:
+        graph: of all numbers; a derivative adds to it.
         inputs: entries of all arguments, array by array.
         outputs: entries of all results, numbers and constants.
         operations: the numbers that the results need, in order.
+        types: of the outputs.
         results: shapes and types of the arrays that the function over arrays returned.
     """
 
-    def __init__(self, inputs: list[np.ndarray], outputs: list[np.ndarray], dtypes: Sequence[Any]):
+    def __init__(self, graph: Graph, inputs: list[np.ndarray], outputs: list[np.ndarray], dtypes: Sequence[Any]):
+        self.graph = graph
         self.inputs = [value for array in inputs for value in array.ravel()]
         self.outputs = [value for array in outputs for value in array.ravel()]
         self.results = [jax.ShapeDtypeStruct(a.shape, dtype) for a, dtype in zip(outputs, dtypes, strict=True)]
-        self._dtypes = [dtype for array, dtype in zip(outputs, dtypes, strict=True) for _ in range(array.size)]
+        self.types = [dtype for array, dtype in zip(outputs, dtypes, strict=True) for _ in range(array.size)]
         self.operations = _needed(self.outputs)
+        self._derived: dict[Any, ScalarProgram] = {}
 
     def __call__(self, args: Sequence[Any]) -> list[Any]:
         """Trace on 0-d values: entries of all results from entries of all arguments, array by array."""
@@ -65,9 +71,22 @@ class ScalarProgram:
             with jax.named_scope(stage):
                 for number in numbers:
                     operands = [read(value) for value in number.operands]
-                    value = _bind(number, operands)
+                    value = bound(number, operands)
                     values[id(number)] = fusion_barrier(value) if id(number) in fenced else value
-        return [typed(read(v), dtype) for v, dtype in zip(self.outputs, self._dtypes, strict=True)]
+        return [typed(read(v), dtype) for v, dtype in zip(self.outputs, self.types, strict=True)]
+
+    def derived(self, key: Any, make: Callable[[], ScalarProgram]) -> ScalarProgram:
+        """A program that is made from this one, once."""
+        if key not in self._derived:
+            self._derived[key] = make()
+        return self._derived[key]
+
+    def sources(self) -> list[int]:
+        """The inputs that each result depends on, as bits."""
+        bits = {id(number): 1 << i for i, number in enumerate(self.inputs)}
+        for number in self.operations:
+            bits[id(number)] = reduce(or_, (bits.get(id(v), 0) for v in number.operands), 0)
+        return [bits.get(id(value), 0) for value in self.outputs]
 
     def _fenced(self) -> set[int]:
         """Numbers to be computed once, so that no consumer of a number repeats more than `_REPEATED` operations."""
@@ -115,7 +134,7 @@ def scalar_program(closed: Any, moving: Sequence[bool] = ()) -> ScalarProgram:
     inputs = arguments(closed.jaxpr.invars)
     outputs = evaluate(graph, closed.jaxpr, consts, inputs)
     dtypes = [v.aval.dtype for v in closed.jaxpr.outvars]
-    return ScalarProgram([*given, *inputs], outputs, dtypes)
+    return ScalarProgram(graph, [*given, *inputs], outputs, dtypes)
 
 
 def _needed(outputs: Sequence[Any]) -> list[Number]:
@@ -134,11 +153,14 @@ def _needed(outputs: Sequence[Any]) -> list[Number]:
     return order
 
 
-def _bind(number: Number, operands: list[Any]) -> Any:
+def bound(number: Number, operands: list[Any]) -> Any:
+    """The number, traced."""
     if number.name == "part":
         return operands[0][number.equation]
     if number.name == "array":
         return number.equation(operands)
+    if number.name == "convert_element_type":
+        return lax.convert_element_type(operands[0], number.dtype)
     plain = _PLAIN.get(number.name)
     if plain is not None:
         return plain(*operands)

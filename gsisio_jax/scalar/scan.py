@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from gsisio_jax.scalar.primitive import run
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
 from gsisio_jax.scalar.unroll import numbers_in
 
@@ -26,7 +27,8 @@ def scan(
     wrap: Callable[..., Any] = lambda step: step,
 ) -> tuple[Any, Any]:
     """``jax.lax.scan``. Packed and unpacked once, at the edge: between steps every number is a 0-d value, which
-    `jax.vmap` makes a vector over the batch. `wrap` is applied to the step (`jax.checkpoint`, say)."""
+    `jax.vmap` makes a vector over the batch. `wrap` is applied to the step (`jax.checkpoint`, say) where it stays one
+    over arrays; over numbers reverse mode keeps nothing but the arguments of a step anyway."""
     rows = jax.tree.leaves(xs)
     turns: int = rows[0].shape[0] if length is None else length
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
@@ -39,12 +41,12 @@ def scan(
     count = sum(math.prod(leaf.shape) for leaf in flat_carry)
 
     def step(numbers: Any, row: Any) -> tuple[Any, Any]:
-        out = program([*consts, *numbers, *row])
+        out = run(program, [*consts, *numbers, *row])
         return tuple(out[:count]), tuple(out[count:])
 
     numbers = tuple(entry for leaf in flat_carry for entry in _entries(leaf, 0))
     columns = tuple(entry for leaf in rows for entry in _entries(leaf, 1))
-    last, kept = jax.lax.scan(wrap(step), numbers, columns, length=turns)
+    last, kept = jax.lax.scan(step, numbers, columns, length=turns)
     leaves = program.results
     packed = _packed([*last], leaves[: len(flat_carry)], ()) + _packed([*kept], leaves[len(flat_carry) :], (turns,))
     return jax.tree.unflatten(structure, packed)
@@ -58,7 +60,7 @@ def call(function: Callable[..., Any], *args: Any) -> Any:
         return function(*args)
     program, consts, structure = traced
     numbers = [entry for leaf in jax.tree.leaves(args) for entry in _entries(leaf, 0)]
-    return jax.tree.unflatten(structure, _packed(program([*consts, *numbers]), program.results, ()))
+    return jax.tree.unflatten(structure, _packed(run(program, [*consts, *numbers]), program.results, ()))
 
 
 def _trace(function: Callable[..., Any], *args: Any) -> tuple[ScalarProgram, list[Any], Any] | None:
