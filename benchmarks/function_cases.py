@@ -179,7 +179,8 @@ def _loops() -> dict[str, Case]:
         "grad": (jax.grad(lambda x: jnp.sin(x[0]) * x[1] ** 2), USUAL),
         "cond, undecided": (lambda x: lax.cond(x[0] > 0.5, jnp.sin, lambda v: v + 1, x), USUAL),
         "switch, three branches": (
-            lambda x: lax.switch((3 * x[0]).astype(int), [jnp.sin, jnp.cos, lambda v: 2 * v], x), USUAL
+            lambda x: lax.switch((3 * x[0]).astype(int), [jnp.sin, jnp.cos, lambda v: 2 * v], x),
+            USUAL,
         ),
         "select": (lambda x: jnp.select([x[0] > 0.7, x[0] > 0.3], [x[1], x[1] ** 2], 0.0), USUAL),
         "piecewise": (lambda x: jnp.piecewise(x, [x < 0.3, x > 0.7], [lambda t: t + 1, lambda t: t * t, 0.5]), USUAL),

@@ -34,8 +34,11 @@ from gsisio_jax.inclusion.node import (
     settled,
     slope_of,
 )
-from gsisio_jax.inclusion.rules import comparison, linear
+from gsisio_jax.inclusion.rules import comparison, linear, patterns
+from gsisio_jax.inclusion.rules.indexing import TooManyPlacesError
+from gsisio_jax.inclusion.rules.library import WHOLE
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
+from gsisio_jax.inclusion.turns import TurnsError, while_loop
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.scalar.unroll import numbers_in
@@ -56,15 +59,26 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
         aval: Any = atom.aval
         return np.asarray(atom.val, aval.dtype)
 
-    for eqn in jaxpr.eqns:
+    known = patterns.find(jaxpr)
+    for place, eqn in enumerate(jaxpr.eqns):
         try:
-            out = _result(eqn, [read(atom) for atom in eqn.invars])
+            out = _recognised(known.get(place), read)
+            out = _result(eqn, [read(atom) for atom in eqn.invars]) if out is None else out
         except UnknownPrimitiveError as error:
-            if error.place is not None or (place := _caller(eqn)) is None:
+            if error.place is not None or (line := _caller(eqn)) is None:
                 raise
-            raise UnknownPrimitiveError(error.operation, error.detail, place) from None
+            raise UnknownPrimitiveError(error.operation, error.detail, line) from None
+        except (NotImplementedError, TooManyPlacesError, TurnsError) as error:
+            raise UnknownPrimitiveError(eqn.primitive.name, str(error), _caller(eqn)) from None
         values.update(zip(eqn.outvars, out if eqn.primitive.multiple_results else [out], strict=True))
     return [read(atom) for atom in jaxpr.outvars]
+
+
+def _recognised(match: Any, read: Callable[[Any], Any]) -> Any:
+    """The value of an equation that ends a known expression."""
+    operands = [read(atom) for atom in match.operands] if match is not None else []
+    value = match.rule(*map(settled, operands)) if any(map(is_node, operands)) else None
+    return None if value is None else settle(value)
 
 
 def _result(eqn: Any, args: Sequence[Any]) -> Any:
@@ -128,7 +142,12 @@ def _body(eqn: Any) -> tuple[Any, Sequence[Any]]:
 def _call(eqn: Any, *args: Any) -> Any:
     jaxpr, consts = _body(eqn)
     name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
-    if name in LIBRARY and source.startswith(_JAX) and any(is_node(arg) for arg in args):
+    ours = source.startswith(_JAX)
+    if ours and name in WHOLE and any(is_node(arg) or isinstance(arg, Tracer) for arg in args):
+        found = WHOLE[name](eqn, *map(settled, args))
+        if found is not None:
+            return [settle(value) if is_node(value) else value for value in found]
+    if name in LIBRARY and ours and any(is_node(arg) for arg in args):
         return [settle(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
     return evaluate(jaxpr, consts, args)
 
@@ -160,6 +179,16 @@ def _scan(eqn: Any, *args: Any) -> Any:
     for i in range(length)[::-1] if reverse else range(length):
         carry, stacked[i] = turn(carry, [linear.move(lambda v, i=i: v[i], x) for x in xs])
     return [*carry, *(_stack(list(column)) for column in zip(*stacked, strict=True))]
+
+
+def _while(eqn: Any, *args: Any) -> list[Any]:
+    def loop(turn: Callable[..., list[Any]], carry: list[Any], count: int) -> list[Any]:
+        return _loop(lambda carry, rows: (turn(carry), []), list(carry), [], count, False)
+
+    def longest(body: Any) -> int:
+        return min(_UNROLL, max(1, _UNROLLED_NUMBERS // max(numbers_in(body), 1)))
+
+    return while_loop(eqn, args, evaluate, loop, longest)
 
 
 def _stack(rows: list[Any]) -> Any:
@@ -236,7 +265,7 @@ def _unstack(form: Any, jac: Any, box: Any) -> tuple[Any, Any]:
     return None if form is None else Form(jnp.swapaxes(form[0], 0, 1), form[1], box), swap
 
 
-CALLS: dict[str, Callable[..., Any]] = {"cond": _cond, "scan": _scan} | dict.fromkeys(
+CALLS: dict[str, Callable[..., Any]] = {"cond": _cond, "scan": _scan, "while": _while} | dict.fromkeys(
     (
         "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint",
         "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
