@@ -67,7 +67,8 @@ def _pairs() -> dict[str, Case]:
         else:
             found[f"jnp.{name}"] = (lambda x, fn=fn: fn(x[0], x[1]), WIDE)
     for name in ("divide", "power", "float_power", "mod", "remainder", "fmod", "floor_divide"):
-        found[f"jnp.{name}"] = (lambda x, fn=getattr(jnp, name): fn(x[0], x[1]), USUAL)
+        fn = getattr(jnp, name)
+        found[f"jnp.{name}"] = (lambda x, fn=fn: fn(x[0], x[1]), USUAL)
     return found
 
 

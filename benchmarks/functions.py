@@ -43,7 +43,7 @@ def ratio(low: Any, high: Any, seen: np.ndarray) -> tuple[float, bool]:
     """How often the bounds are as wide as the points, in the worst entry; do they contain them?"""
     low, high = np.asarray(low, float), np.asarray(high, float)
     least, most = seen.min(0), seen.max(0)
-    size = 1e-9 * (1 + np.maximum(abs(least), abs(most)))
+    size = 1e-9 * (1 + np.maximum(abs(least), abs(most)))  # rounding of the points
     inside = bool((low <= least + 1e-3 * size).all() and (high >= most - 1e-3 * size).all())
     with np.errstate(all="ignore"):
         wide = (high - low) / np.maximum(most - least, 1e-9)
@@ -84,7 +84,7 @@ def survey(fn: Any, box: tuple[list[float], list[float]], count: int) -> dict[st
             slopes = np.asarray(jax.jit(jax.vmap(jax.jacfwd(plain)))(at))
         except Exception:
             slopes = np.zeros((1, *values.shape[1:], len(lower)))
-    jumps = _jumps(plain, at, lower, upper)
+    jumps = _jumps(plain, lower, upper)
     found: dict[str, Any] = {}
     started = time.process_time()
     try:
@@ -107,15 +107,20 @@ def survey(fn: Any, box: tuple[list[float], list[float]], count: int) -> dict[st
     return found
 
 
-def _jumps(plain: Any, at: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
+def _jumps(plain: Any, lower: np.ndarray, upper: np.ndarray) -> bool:
     """Does it change by much over a very small distance, on lines through the box?"""
-    line = lower + np.linspace(0, 1, 20001)[:, None] * (upper - lower)
-    try:
-        values = np.asarray(jax.jit(jax.vmap(plain))(line)).reshape(len(line), -1)
-    except NotImplementedError:
-        return False
-    change = np.abs(np.diff(values, axis=0))
-    return bool((change.max(0) > 50 * (np.median(change, 0) + 1e-4)).any())
+    share, middle = np.linspace(-0.5, 0.5, 20001)[:, None], 0.5 * (lower + upper)
+    rng = np.random.default_rng(2)
+    for direction in (np.ones(len(lower)), *rng.uniform(-1, 1, (3, len(lower)))):
+        line = middle + share * direction * (upper - lower)
+        try:
+            values = np.asarray(jax.jit(jax.vmap(plain))(line)).reshape(len(line), -1)
+        except NotImplementedError:
+            return False
+        change = np.abs(np.diff(values, axis=0))
+        if (change.max(0) > 50 * (np.median(change, 0) + 1e-4)).any():
+            return True
+    return False
 
 
 def _quotients_inside(jac: Any, at: np.ndarray, values: np.ndarray) -> bool:

@@ -62,7 +62,7 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
     known = patterns.find(jaxpr)
     for place, eqn in enumerate(jaxpr.eqns):
         try:
-            out = _recognised(known.get(place), read)
+            out = _recognised(known.get(place), read) if eqn.primitive.name not in _BY_HAND else None
             out = _result(eqn, [read(atom) for atom in eqn.invars]) if out is None else out
         except UnknownPrimitiveError as error:
             if error.place is not None or (line := _caller(eqn)) is None:

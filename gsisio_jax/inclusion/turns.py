@@ -103,6 +103,6 @@ def _count(
 def _anything(value: Any) -> Node:
     """A node of which nothing is known."""
     shape = value.shape if is_node(value) else np.shape(value)
-    if jnp.result_type(value.dtype) == bool:
+    if jnp.issubdtype(value.dtype, jnp.bool_):
         return Node(Interval.unchecked(np.zeros(shape, bool), np.ones(shape, bool)))
     return Node(entire_like(jnp.zeros(shape)))

@@ -191,7 +191,7 @@ def _exponents(graph: _Jaxpr, atom: Any) -> tuple[Any, tuple[int, ...]] | None:
 
 
 def _unshifted(graph: _Jaxpr, h: Any, axes: tuple[int, ...]) -> tuple[Any, Any]:
-    """``h = a - m`` with an m that is common to all entries along the axes: a and m (without the axes), else h, None."""
+    """``h = a - m`` with an m that is common to all entries along the axes: a and m (without them), else h, None."""
     difference = graph.made(graph.plain(h), "sub")
     if difference is None:
         return h, None

@@ -1,8 +1,9 @@
 """Tables of numbers as what they are: piecewise-linear functions of one variable (`jnp.interp`).
 
-``phi`` is given by its knots t_i (increasing) with values v_i, and by what it does beyond them. On an interval [a, b] the
-extremes of ``phi(t) - s t`` lie at a, at b or at a knot between them, for every s: range and rest are minima and maxima
-over the knots, exact but for rounding, and the derivative is the hull of the slopes of the segments that [a, b] meets.
+``phi`` is given by its knots t_i (increasing) with values v_i, and by what it does beyond them. On an interval [a, b]
+the extremes of ``phi(t) - s t`` lie at a, at b or at a knot between them, for every s: range and rest are minima and
+maxima over the knots, exact but for rounding, and the derivative is the hull of the slopes of the segments that [a, b]
+meets.
 
 Rounding: knots and values are numbers as they stand. Slopes are computed in fractions while tracing and kept as the two
 floating numbers around each. A value at a, ``v_i + m_i (a - t_i)``, is off by ``4 eps (|v_i| + |m_i (a - t_i)|)``.
