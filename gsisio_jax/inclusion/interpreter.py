@@ -36,9 +36,12 @@ from gsisio_jax.inclusion.node import (
     slope_of,
 )
 from gsisio_jax.inclusion.origin import remember
-from gsisio_jax.inclusion.rules import comparison, linear
+from gsisio_jax.inclusion.rules import comparison, linear, patterns
+from gsisio_jax.inclusion.rules.indexing import TooManyPlacesError
+from gsisio_jax.inclusion.rules.library import WHOLE
 from gsisio_jax.inclusion.rules.piecewise import by_pieces
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
+from gsisio_jax.inclusion.turns import TurnsError, while_loop
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.scalar.unroll import called_jaxpr, numbers_in
@@ -64,16 +67,23 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
         aval: Any = atom.aval
         return np.asarray(atom.val, aval.dtype)
 
-    for eqn in jaxpr.eqns:
+    known = patterns.find(jaxpr)
+    for place, eqn in enumerate(jaxpr.eqns):
         try:
-            operands = [read(atom) for atom in eqn.invars]
-            out = _watched(eqn, operands)
+            operands, rule = [read(atom) for atom in eqn.invars], None
+            out = _recognised(known.get(place), read) if eqn.primitive.name not in _BY_HAND else None
+            if out is None:
+                out = _watched(eqn, operands)
+            else:
+                rule, operands = known[place].rule, [normalised(read(atom)) for atom in known[place].operands]
         except UnknownPrimitiveError as error:
-            if error.place is not None or (place := _caller(eqn)) is None:
+            if error.place is not None or (line := _caller(eqn)) is None:
                 raise
-            raise UnknownPrimitiveError(error.operation, error.detail, place) from None
+            raise UnknownPrimitiveError(error.operation, error.detail, line) from None
+        except (NotImplementedError, TooManyPlacesError, TurnsError) as error:
+            raise UnknownPrimitiveError(eqn.primitive.name, str(error), _caller(eqn)) from None
         results = out if eqn.primitive.multiple_results else [out]
-        remember(eqn, operands, results)
+        remember(eqn, operands, results, rule)
         values.update(zip(eqn.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
@@ -92,6 +102,13 @@ def _watched(eqn: Any, args: Sequence[Any]) -> Any:
         return out
     finally:
         _PLACES.reset(token)
+
+
+def _recognised(match: Any, read: Callable[[Any], Any]) -> Any:
+    """The value of an equation that ends a known expression."""
+    operands = [read(atom) for atom in match.operands] if match is not None else []
+    value = match.rule(*map(normalised, operands)) if any(map(is_node, operands)) else None
+    return None if value is None else normalise(value)
 
 
 def _result(eqn: Any, args: Sequence[Any]) -> Any:
@@ -151,7 +168,12 @@ def _call(eqn: Any, *args: Any) -> Any:
     except LookupError:
         raise UnknownPrimitiveError(eqn.primitive.name, "without a body") from None
     name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
-    if name in LIBRARY and source.startswith(_JAX) and any(is_node(arg) for arg in args):
+    ours = source.startswith(_JAX)
+    if ours and name in WHOLE and any(is_node(arg) or isinstance(arg, Tracer) for arg in args):
+        found = WHOLE[name](eqn, *map(normalised, args))
+        if found is not None:
+            return [normalise(value) if is_node(value) else value for value in found]
+    if name in LIBRARY and ours and any(is_node(arg) for arg in args):
         return [normalise(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
     return evaluate(jaxpr, consts, args)
 
@@ -183,6 +205,16 @@ def _scan(eqn: Any, *args: Any) -> Any:
     for i in range(length)[::-1] if reverse else range(length):
         carry, stacked[i] = turn(carry, [linear.move(lambda v, i=i: v[i], x) for x in xs])
     return [*carry, *(_stack(list(column)) for column in zip(*stacked, strict=True))]
+
+
+def _while(eqn: Any, *args: Any) -> list[Any]:
+    def loop(turn: Callable[..., list[Any]], carry: list[Any], count: int) -> list[Any]:
+        return _loop(lambda carry, rows: (turn(carry), []), list(carry), [], count, False)
+
+    def longest(body: Any) -> int:
+        return min(_UNROLL, max(1, _UNROLLED_NUMBERS // max(numbers_in(body), 1)))
+
+    return while_loop(eqn, args, evaluate, loop, longest)
 
 
 def _stack(rows: list[Any]) -> Any:
@@ -259,7 +291,7 @@ def _unstack(form: Any, jac: Any, box: Any) -> tuple[Any, Any]:
     return None if form is None else Form(jnp.swapaxes(form[0], 0, 1), form[1], box), swap
 
 
-CALLS: dict[str, Callable[..., Any]] = {"cond": _cond, "scan": _scan} | dict.fromkeys(
+CALLS: dict[str, Callable[..., Any]] = {"cond": _cond, "scan": _scan, "while": _while} | dict.fromkeys(
     (
         "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint",
         "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",

@@ -20,11 +20,19 @@ MOST_OPERATIONS = 200  # that one evaluation once more may cost
 
 
 class Origin(NamedTuple):
-    """The equation of a node, its operands (nodes and constants), and which of its results the node is."""
+    """Where a node comes from.
+
+    Attributes:
+        equation: that made it.
+        operands: nodes and constants.
+        index: which of the results of the equation it is.
+        rule: makes it from the operands in the place of the equation, where it ends an expression known as a whole.
+    """
 
     equation: Any
     operands: Sequence[Any]
     index: int
+    rule: Callable[..., Any] | None = None
 
     @property
     def name(self) -> str:
@@ -35,11 +43,13 @@ class NotAgain(Exception):
     """It would take more than `MOST_OPERATIONS`, or mix entries where that is not allowed."""
 
 
-def remember(equation: Any, operands: Sequence[Any], results: Sequence[Any]) -> None:
+def remember(
+    equation: Any, operands: Sequence[Any], results: Sequence[Any], rule: Callable[..., Any] | None = None
+) -> None:
     """Note where nodes come from that have no origin yet."""
     for index, result in enumerate(results):
         if is_node(result) and origin(result) is None and all(result is not v for v in operands):
-            object.__setattr__(result, "origin", Origin(equation, tuple(operands), index))
+            object.__setattr__(result, "origin", Origin(equation, tuple(operands), index, rule))
 
 
 def origin(value: Any) -> Origin | None:
@@ -60,6 +70,8 @@ def same(a: Any, b: Any, memo: dict[tuple[int, int], bool] | None = None) -> boo
         return a.dtype == b.dtype and a.shape == b.shape and bool(np.array_equal(a, b))
     first, second = origin(a), origin(b)
     if first is None or second is None or first.name != second.name or first.index != second.index:
+        return False
+    if first.rule is not second.rule:
         return False
     memo = {} if memo is None else memo
     pair = id(a), id(b)
@@ -128,12 +140,23 @@ class Again:
         if found.name == "select_n" and (chosen := decided(operands[0])) is not None:
             return operands[1 + chosen]
         self._operations += 1
-        if self._operations > MOST_OPERATIONS or not (self.allowed is None or found.name in self.allowed):
+        if self._operations > MOST_OPERATIONS or not (self.allowed is None or self._keeps_entries_apart(found)):
             raise NotAgain
-        out = self.apply(found.equation, operands)
-        results = out if found.equation.primitive.multiple_results else [out]
-        remember(found.equation, operands, results)
+        if found.rule is not None:
+            results = [found.rule(*operands)]
+            if results[0] is None:
+                raise NotAgain
+        else:
+            out = self.apply(found.equation, operands)
+            results = out if found.equation.primitive.multiple_results else [out]
+        remember(found.equation, operands, results, found.rule)
         return results[found.index]
+
+    def _keeps_entries_apart(self, found: Origin) -> bool:
+        shape = found.equation.outvars[found.index].aval.shape
+        alike = found.rule is None or all(np.shape(v) == shape for v in found.operands if not is_node(v))
+        alike &= found.rule is None or all(v.shape == shape for v in found.operands if is_node(v))
+        return alike and self.allowed is not None and found.name in self.allowed
 
 
 def decided(which: Any) -> int | None:

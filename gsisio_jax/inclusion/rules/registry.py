@@ -16,7 +16,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.node import Node, is_node, normalised
-from gsisio_jax.inclusion.rules import bilinear, comparison, functions, linear, univariate
+from gsisio_jax.inclusion.rules import (
+    bilinear,
+    comparison,
+    convolution,
+    functions,
+    indexing,
+    library,
+    linear,
+    order,
+    solving,
+    univariate,
+)
 from gsisio_jax.interval.box import Interval
 
 
@@ -36,15 +47,18 @@ class UnknownPrimitiveError(ValueError):
 Rule = Callable[..., Any]
 
 
-def _structural(*data: int, terms: Callable[[Any], int] = lambda eqn: 1) -> Rule:
+def _structural(*data: int, terms: Callable[[Any], int] = lambda eqn: 1, moving: Rule | None = None) -> Rule:
     """Rule for a primitive that moves entries about or sums them; `data` are its arguments that are values.
 
-    The others (indices) must be constants. No numbers: all arguments are values. `terms` says how many it adds at most.
+    The others (indices) must be constants, unless there is a rule for `moving` ones. No numbers: all arguments are
+    values. `terms` says how many it adds at most.
     """
 
     def rule(eqn: Any, *args: Any) -> Any:
         where = data or tuple(range(len(args)))
         if any(is_node(arg) for i, arg in enumerate(args) if i not in where):
+            if moving is not None:
+                return moving(eqn, *args)
             raise UnknownPrimitiveError(eqn.primitive.name, "with indices that depend on the box")
         fixed = list(args)
 
@@ -214,12 +228,13 @@ REDUCTIONS: dict[str, Rule] = {
     "scatter-add": _structural(0, 2, terms=_scattered),
     "scatter_add": _structural(0, 2, terms=_scattered),
     "cumsum": _structural(terms=lambda eqn: eqn.invars[0].aval.shape[eqn.params["axis"]]),
+    "conv_general_dilated": convolution.convolve,
 }
 ELEMENTWISE |= {name: _curve(name) for name in functions.CURVES}
 # Of these the result is not exact even where the arguments are.
 ROUNDED = {
     "add", "add_any", "sub", "mul", "div", "rem", "pow", "integer_pow", "atan2", "dot_general", "reduce_sum",
-    "reduce_prod", "cumprod", "scatter-add", "scatter_add", "cumsum", *functions.CURVES,
+    "reduce_prod", "cumprod", "conv_general_dilated", "scatter-add", "scatter_add", "cumsum", *functions.CURVES,
 } - {"abs"}  # fmt: skip
 # Results of these need no widening: they only move numbers about, or their insides have been through it.
 MOVES: dict[str, Rule] = {
@@ -241,12 +256,28 @@ MOVES: dict[str, Rule] = {
         "stack": (),
         "split": (0,),
         "slice": (0,),
-        "dynamic_slice": (0,),
-        "dynamic_update_slice": (0, 1),
-        "gather": (0,),
         "scatter": (0, 2),
         "pad": (0, 1),
+        "device_put": (),
+        "unstack": (0,),
     }.items()
+}
+MOVES |= {
+    "gather": _structural(0, moving=indexing.gather),
+    "dynamic_slice": _structural(0, moving=indexing.dynamic_slice),
+    "dynamic_update_slice": _structural(0, 1, moving=indexing.dynamic_update_slice),
+    "sort": order.sort,
+    "top_k": order.top_k,
+    "argmax": order.argmax,
+    "argmin": order.argmin,
+    "lu": lambda eqn, a: solving.lu(a),
+    "cholesky": lambda eqn, a: solving.cholesky(a),
+    "triangular_solve": solving.triangular_solve,
+    "custom_linear_solve": library.linear_system,
+    "debug_callback": lambda eqn, *args: [],
+    "debug_print": lambda eqn, *args: [],
+    "lt_to": ELEMENTWISE["lt"],
+    "le_to": ELEMENTWISE["le"],
 }
 
 # Functions of JAX's own libraries whose body loses what the function as a whole keeps. Matched by name, and only where

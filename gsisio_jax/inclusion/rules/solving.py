@@ -1,0 +1,303 @@
+"""Linear algebra of small matrices whose entries depend on the box: systems, determinants, factors.
+
+**Systems.** With C near the inverse of A at its center and any vector x~, the solution of ``A x = b`` is
+
+    x = x~ + y,    y = C r + E y,    r = b - A x~,    E = I - C A.
+
+r is linear in A and b, so C r keeps slopes, while ``E y`` is of second order in the widths and goes to the offset. A
+vector u > 0 with ``|E| u + |C r| <= u`` and, strictly, ``|E| u < u`` proves that every A of the enclosure is regular
+(the spectral radius of E is below 1) and that ``|y| <= u``; one is computed to nearest and then checked, rounded
+outward. Without one nothing is known of x: the bounds are infinite. Derivatives solve the same system,
+``dx = A^-1 (db - dA x)``. C and x~ are numbers like any others: how well they are known makes no difference to what is
+proved. A matrix that does not depend on the box is inverted in fractions.
+
+**Determinants** are expanded by rows over all minors of the last columns; **factors** are eliminated entry by entry,
+without exchange of rows: what does not hold for all matrices of the enclosure is not known.
+"""
+
+from __future__ import annotations
+
+import itertools
+from fractions import Fraction
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.inclusion.form_arithmetic import box_sum, is_known, product
+from gsisio_jax.inclusion.node import Node, as_node, is_node, jac_of, meet, normalised, parts
+from gsisio_jax.inclusion.rules.bilinear import divide, multiply
+from gsisio_jax.inclusion.rules.functions import CURVES, SQUARE
+from gsisio_jax.inclusion.rules.linear import add, move, multiple, structural, subtract, total
+from gsisio_jax.inclusion.rules.possible import formless, unknown
+from gsisio_jax.inclusion.rules.univariate import apply
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, choose, entire_like, magnitude
+
+MOST_ROWS = 12
+
+
+# Systems --------------------------------------------------------------------------------------------------------------
+def solve(a: Any, b: Any) -> Any:
+    """Solution of ``a x = b``; a (n, n), b (n,) or (n, m), nodes or constants, one of them a node."""
+    if not is_node(a):
+        if is_known(a):
+            return _solve_known(a, b)
+        a = as_node(a, np.shape(a), b.dtype)
+    a = normalised(a)
+    columns = len(_shape(b)) == 2
+    b = normalised(b) if is_node(b) else as_node(b, np.shape(b), a.dtype)
+    b = b if columns else move(lambda v: v[:, None], b)
+    x = _solve_columns(a, b)
+    return x if columns else move(lambda v: v[:, 0], x)
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    return value.shape if is_node(value) else np.shape(value)
+
+
+def _times(a: Any, b: Any) -> Any:
+    """Matrix product (n, k) (k, m) of nodes and constants."""
+    n, k, m = *_shape(a), _shape(b)[1]
+    wide_a = move(lambda v: jnp.broadcast_to(v[:, :, None], (n, k, m)), a)
+    wide_b = move(lambda v: jnp.broadcast_to(v[None], (n, k, m)), b)
+    return total(multiply(wide_a, wide_b), [1])
+
+
+def _image(a: Interval, b: Interval) -> Interval:
+    """Product of two boxes of matrices, (..., n, k) and (..., k, m)."""
+    terms = product(
+        Interval.unchecked(a.lower[..., :, :, None], a.upper[..., :, :, None]),
+        Interval.unchecked(b.lower[..., None, :, :], b.upper[..., None, :, :]),
+    )
+    return Interval.unchecked(rounding.sum_down(terms.lower, -2), rounding.sum_up(terms.upper, -2))
+
+
+def _solve_columns(a: Node, b: Node) -> Node:
+    n = a.shape[0]
+    c = _inverse(a.range.center)
+    x = _clean(c @ _clean(b.range.center))
+    # E = I - C A; the bounds of its entries are all that is used of it.
+    eye = np.eye(n, dtype=a.dtype)
+    error = normalised(subtract(eye, _times(c, formless(a)))).range
+    small = magnitude(error)
+    residual = subtract(b, _times(a, x))
+    start = normalised(_times(c, formless(residual)))
+    reached = magnitude(start.range)
+    u, proved = _fixed_radius(small, reached)
+    spread = Interval.unchecked(-u, u)
+    left = _image(error, spread)
+    y = box_sum(start.range, left)
+    y = Interval.unchecked(jnp.maximum(y.lower, -u), jnp.minimum(y.upper, u))
+    left = _image(error, y)
+    moved = add(add(start, Node(left)), _as_rest(x, a.dtype))
+    natural = choose(proved, normalised(moved).range, entire_like(y))
+    form = normalised(moved).form
+    if form is not None:
+        form = type(form)(
+            jnp.where(proved, form.slope, 0),
+            choose(proved, form.offset, entire_like(form.offset)),
+            form.box,
+            None if form.slack is None else jnp.where(proved, form.slack, 0),
+        )
+    _, jac = parts([a, b])
+    if jac is not None:
+        jac = _derivative(a, b, c, error, small, natural)
+    return meet(Node(natural, form, jac))
+
+
+def _as_rest(x: Any, dtype: Any) -> Node:
+    return Node(Interval.unchecked(x.astype(dtype), x.astype(dtype)))
+
+
+def _derivative(a: Node, b: Node, c: Any, error: Interval, small: Any, x: Interval) -> Interval:
+    """``dx = C (db - dA x) + E dx`` for every entry of the box: (size, n, m)."""
+    size = next(v.jac.lower.shape[0] for v in (a, b) if v.jac is not None)
+    ja, jb = jac_of(a, size), jac_of(b, size)
+    right = box_sum(jb, _flip(_image(ja, x)))
+    wide = Interval.unchecked(*(jnp.broadcast_to(side, (size, *side.shape)) for side in (c, c)))
+    start = _image(wide, right)
+    u, proved = _fixed_radius(small, magnitude(start))
+    spread = Interval.unchecked(-u, u)
+    every = Interval.unchecked(*(jnp.broadcast_to(side, (size, *side.shape)) for side in (error.lower, error.upper)))
+    found = box_sum(start, _image(every, spread))
+    found = Interval.unchecked(jnp.maximum(found.lower, -u), jnp.minimum(found.upper, u))
+    found = box_sum(start, _image(every, found))
+    found = choose(proved, found, entire_like(found))
+    # An entry of the box on which neither side depends.
+    still = ((right.lower == 0) & (right.upper == 0)).all((-2, -1), keepdims=True)
+    return choose(still & proved, Interval.unchecked(0.0, 0.0), found)
+
+
+def _flip(a: Interval) -> Interval:
+    return Interval.unchecked(-a.upper, -a.lower)
+
+
+def _fixed_radius(small: Any, reached: Any) -> tuple[Any, Any]:
+    """u (..., n, m) with ``small u + reached <= u``, and whether that was proved; see the module docstring."""
+    small, reached = jax.lax.stop_gradient((small, reached))
+    n = small.shape[-1]
+    finite = jnp.isfinite(small).all() & (small.sum(-1).max() < 1e6)
+    safe = jnp.where(finite, small, 0)
+    least = jnp.maximum(reached.max((-2, -1), keepdims=True), 1e-30) * 2.0**-40
+    right = jnp.where(jnp.isfinite(reached), reached, 0) + least
+    # The Neumann series, by doubling; where it diverges the check below fails.
+    inverse, power = jnp.eye(n, dtype=small.dtype) + safe, safe
+    for _ in range(6):
+        power = jnp.minimum(power @ power, 1e6)
+        inverse = jnp.minimum(inverse + power @ inverse, 1e12)
+    share = float(2.0**-20 if small.dtype == jnp.float64 else 2.0**-10)
+    u = (inverse @ right) * (1 + share) + float(jnp.finfo(small.dtype).tiny) * 2.0**20
+    moved = rounding.sum_up(small[..., :, None, :] * jnp.swapaxes(u, -1, -2)[..., None, :, :], -1)
+    needed = rounding.up(moved + reached, 4.0)
+    proved = finite & (needed <= u) & (moved < u) & jnp.isfinite(u)
+    return u, proved.all((-2, -1), keepdims=True)
+
+
+def _clean(x: Any) -> Any:
+    return jnp.where(jnp.isfinite(x), x, 0)
+
+
+def _inverse(a: Any) -> Any:
+    """Near the inverse, or any numbers where there is none."""
+    n = a.shape[0]
+    if n == 1:
+        return _clean(1 / jnp.where(a == 0, 1, a))
+    if n > 3:
+        good = jnp.linalg.det(_clean(a)) != 0
+        return _clean(jnp.linalg.inv(jnp.where(good, _clean(a), jnp.eye(n, dtype=a.dtype))))
+    a = _clean(a)
+    if n == 2:
+        adjugate = jnp.array([[a[1, 1], -a[0, 1]], [-a[1, 0], a[0, 0]]])
+    else:
+        p, q, r = a[:, 0], a[:, 1], a[:, 2]
+        adjugate = jnp.stack([_cross(q, r), _cross(r, p), _cross(p, q)])
+    determinant = (adjugate[0] * a[:, 0]).sum()
+    return _clean(adjugate / jnp.where(determinant == 0, 1, determinant))
+
+
+def _cross(p: Any, q: Any) -> Any:
+    return jnp.stack([p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]])
+
+
+def _solve_known(a: Any, b: Node) -> Node:
+    """A known matrix: its inverse in fractions, each entry rounded once."""
+    inverse = _exact_inverse(np.asarray(a))
+    if inverse is None:
+        return unknown(b.shape, b.dtype, [b])
+    columns = len(b.shape) == 2
+    rows = move(lambda v: v if columns else v[:, None], b)
+    n, m = rows.shape
+    wide = move(lambda v: jnp.broadcast_to(v[None], (n, n, m)), rows)
+    factor = np.broadcast_to(inverse.astype(b.dtype)[:, :, None], (n, n, m))
+    x = total(multiple(factor, wide, rounded=True), [1])
+    return x if columns else move(lambda v: v[:, 0], x)
+
+
+def _exact_inverse(a: np.ndarray) -> np.ndarray | None:
+    n = len(a)
+    rows = [[Fraction(float(v)) for v in row] + [Fraction(int(i == j)) for j in range(n)] for i, row in enumerate(a)]
+    for k in range(n):
+        pivot = next((i for i in range(k, n) if rows[i][k]), None)
+        if pivot is None:
+            return None
+        rows[k], rows[pivot] = rows[pivot], rows[k]
+        rows[k] = [v / rows[k][k] for v in rows[k]]
+        for i in range(n):
+            if i != k and rows[i][k]:
+                factor = rows[i][k]
+                rows[i] = [v - factor * w for v, w in zip(rows[i], rows[k], strict=True)]
+    return np.array([[float(v) for v in row[n:]] for row in rows])
+
+
+# Determinants ---------------------------------------------------------------------------------------------------------
+def determinant(a: Node) -> Node:
+    """Of a node (n, n), over the minors of its first k rows: n products of arrays."""
+    n = a.shape[0]
+    minors = move(lambda v: v[0], a)  # of row 0 and column j
+    before: list[tuple[int, ...]] = [(j,) for j in range(n)]
+    for k in range(1, n):
+        sets = list(itertools.combinations(range(n), k + 1))
+        columns = np.array(sets)
+        rest = np.array([[before.index(s[:i] + s[i + 1 :]) for i in range(k + 1)] for s in sets])
+        signs = np.array([(-1.0) ** (k - i) for i in range(k + 1)])
+        row = move(lambda v, k=k, columns=columns: v[k][columns], a)
+        below = move(lambda v, rest=rest: v[rest], minors)
+        signed = multiple(np.broadcast_to(signs, rest.shape), below)
+        minors, before = total(multiply(row, signed), [1]), sets
+    return move(lambda v: v[0], minors)
+
+
+# Factors --------------------------------------------------------------------------------------------------------------
+def _entries(a: Node) -> list[list[Any]]:
+    n, m = a.shape
+    return [[move(lambda v, i=i, j=j: v[i, j], a) for j in range(m)] for i in range(n)]
+
+
+def _matrix(rows: list[list[Any]]) -> Node:
+    flat = [v for row in rows for v in row]
+    shape = (len(rows), len(rows[0]))
+    return structural(lambda *v: jnp.stack(v).reshape(shape), flat)[0]
+
+
+def cholesky(a: Node) -> Node:
+    """The lower factor L of ``a = L L'``; only the lower triangle of a is looked at."""
+    n, entries = a.shape[0], _entries(normalised(a))
+    zero = np.zeros((), a.dtype)
+    factor: list[list[Any]] = [[zero] * n for _ in range(n)]
+    for j in range(n):
+        rest = entries[j][j]
+        for k in range(j):
+            rest = subtract(rest, apply(SQUARE, factor[j][k]))
+        factor[j][j] = apply(CURVES["sqrt"], normalised(rest))
+        for i in range(j + 1, n):
+            rest = entries[i][j]
+            for k in range(j):
+                rest = subtract(rest, multiply(factor[i][k], factor[j][k]))
+            factor[i][j] = normalised(divide(normalised(rest), factor[j][j]))
+    return _matrix(factor)
+
+
+def lu(a: Node) -> list[Node]:
+    """Factors, pivots and permutation, as long as no row needs to be exchanged; else nothing is known of them."""
+    n, rows = a.shape[0], _entries(normalised(a))
+    certain = jnp.ones((), bool)
+    for k in range(n):
+        pivot = normalised(rows[k][k]).range
+        least = jnp.where((pivot.lower <= 0) & (pivot.upper >= 0), 0, jnp.minimum(abs(pivot.lower), abs(pivot.upper)))
+        certain &= least > 0
+        for i in range(k + 1, n):
+            certain &= magnitude(normalised(rows[i][k]).range) < least
+            rows[i][k] = normalised(divide(rows[i][k], rows[k][k]))
+            for j in range(k + 1, n):
+                rows[i][j] = normalised(subtract(rows[i][j], multiply(rows[i][k], rows[k][j])))
+    factors = _matrix(rows)
+    nothing = unknown(a.shape, a.dtype, [a])
+    found = structural(lambda p, q: jnp.where(certain, p, q), [factors, nothing], [certain])[0]
+    places = np.arange(n, dtype=float)
+    order = Interval.unchecked(jnp.where(certain, places, 0), jnp.where(certain, places, n - 1.0))
+    jac = None
+    if a.jac is not None:
+        flat = jnp.zeros((a.jac.lower.shape[0], n))
+        jac = choose(certain, Interval.unchecked(flat, flat), entire_like(flat))
+    return [found, Node(order, None, jac), Node(order, None, jac)]
+
+
+def triangular_solve(eqn: Any, a: Any, b: Any) -> Any:
+    """As any other system: the other triangle is 0, and the diagonal 1 where that is asked for."""
+    left, lower, transposed, unit = (eqn.params[key] for key in ("left_side", "lower", "transpose_a", "unit_diagonal"))
+    n = _shape(a)[-1]
+    mask = np.tril(np.ones((n, n), bool)) if lower else np.triu(np.ones((n, n), bool))
+
+    # With the matrix on the right, x a = b, the transposed system is solved.
+    turned = bool(transposed) == bool(left)
+    a = move(lambda v: jnp.where(mask, v, 0).T if turned else jnp.where(mask, v, 0), a)
+    if unit:
+        diagonal = np.eye(n, dtype=bool)
+        one = np.eye(n)
+        a = move(lambda v: jnp.where(diagonal, 0, v), a)
+        a = add(a, one) if is_node(a) else a + one
+    if left:
+        return solve(a, b)
+    return move(lambda v: v.T, solve(a, move(lambda v: v.T, b)))

@@ -1,0 +1,215 @@
+"""Tables of numbers as what they are: piecewise-linear functions of one variable (`jnp.interp`).
+
+``phi`` is given by its knots t_i (increasing) with values v_i, and by what it does beyond them. On an interval [a, b]
+the extremes of ``phi(t) - s t`` lie at a, at b or at a knot between them, for every s: range and rest are minima and
+maxima over the knots, exact but for rounding, and the derivative is the hull of the slopes of the segments that [a, b]
+meets.
+
+Rounding: knots and values are numbers as they stand. Slopes are computed in fractions while tracing and kept as the two
+floating numbers around each. A value at a, ``v_i + m_i (a - t_i)``, is off by ``4 eps (|v_i| + |m_i (a - t_i)|)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import jax
+import jax.extend.core as jex
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.inclusion.rules.univariate import extremes
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, choose
+
+
+@dataclass(frozen=True, eq=False)
+class PiecewiseLinear:
+    """A piecewise-linear function, continuous between its first and last knot.
+
+    Attributes:
+        knots: (K,), increasing.
+        values: (K,).
+        tails: slope before the first knot and after the last one: 0, or that of the first and last segment.
+        beyond: value next to the first and last knot, outside; where it is not that of the knot, the function jumps.
+        low, high: (K + 1,), the floating numbers around the slope of every segment, tails included.
+    """
+
+    knots: np.ndarray
+    values: np.ndarray
+    tails: tuple[float, float]
+    beyond: tuple[float, float]
+    low: np.ndarray
+    high: np.ndarray
+
+    @classmethod
+    def of(
+        cls, knots: Any, values: Any, beyond: tuple[float, float] | None = None, extrapolates: bool = False
+    ) -> PiecewiseLinear:
+        """From a table; beyond its ends the function keeps its values, or those of `beyond`, or goes on as it was."""
+        knots, values = np.asarray(knots), np.asarray(values)
+        t, v = [Fraction(float(x)) for x in knots], [Fraction(float(x)) for x in values]
+        slopes = [(v[i + 1] - v[i]) / (t[i + 1] - t[i]) for i in range(len(t) - 1)] or [Fraction(0)]
+        exact = [slopes[0], *slopes, slopes[-1]] if extrapolates else [Fraction(0), *slopes, Fraction(0)]
+        low, high = (np.array([_near(slope, side, knots.dtype) for slope in exact]) for side in (-1, 1))
+        tails = (float(exact[0]), float(exact[-1]))
+        beyond = (float(values[0]), float(values[-1])) if beyond is None else beyond
+        return cls(knots, values, tails, beyond, low, high)
+
+    @property
+    def jumps(self) -> tuple[bool, bool]:
+        return self.beyond[0] != self.values[0], self.beyond[1] != self.values[-1]
+
+    def _at(self, t: Any) -> tuple[Any, Any]:
+        """Value at t, and what its error goes with."""
+        # Segment i ends at knot i: 0 is the left tail.
+        i = (t[..., None] > self.knots).sum(-1)
+        # A knot is an end of its segment, whose value it has: t = t_0 lies in no tail that jumps.
+        first = t == self.knots[0]
+        i = jnp.where(first, min(1, len(self.knots) - 1), i)
+        at = jnp.maximum(i - 1, 0)
+        start = jnp.asarray(self.values)[at]
+        outside = [(i == 0) & ~first, i == len(self.knots)]
+        for where, value in zip(outside, self.beyond, strict=True):
+            start = jnp.where(where, value, start)
+        slope = jnp.asarray(0.5 * self.low + 0.5 * self.high)[jnp.where(first, 0, i)]
+        finite = jnp.isfinite(t)
+        step = jnp.where(finite, t, self.knots[0]) - jnp.asarray(self.knots)[at]
+        rise = slope * step
+        value, size = start + rise, abs(start) + abs(rise)
+        for side, tail in zip((-jnp.inf, jnp.inf), self.tails, strict=True):
+            if tail:
+                value = jnp.where(t == side, side * np.sign(tail), value)
+        return value, jnp.where(finite, size, abs(start))
+
+    def _points(self, a: Any, b: Any, s: Any) -> tuple[Any, Any, Any]:
+        """``phi - s t`` at every knot, which of them lie between a and b, and what the error goes with."""
+        knots, values = self.knots, self.values
+        inside = (a[..., None] <= knots) & (knots <= b[..., None])
+        for k, jump in zip((0, -1), self.jumps, strict=True):
+            if jump:
+                # The limit from outside, where that is part of the interval.
+                beyond = inside[..., k] & ((a if k == 0 else -b) < (knots[0] if k == 0 else -knots[-1]))
+                inside = jnp.concatenate([inside, beyond[..., None]], -1)
+                knots, values = np.append(knots, self.knots[k]), np.append(values, self.beyond[k])
+        if s is None:
+            return jnp.broadcast_to(values, inside.shape), inside, None
+        products = s[..., None] * knots
+        return values - products, inside, abs(values) + abs(products)
+
+    def _extremes(self, a: Any, b: Any, s: Any) -> Interval:
+        """Range of ``phi - s t`` on [a, b], of phi itself for None; sides of a and b are infinite only there."""
+        ends = []
+        for t in (a, b):
+            value, size = self._at(t)
+            if s is not None:
+                value, size = value - s * t, size + abs(s * t)
+            ends.append((rounding.lowered(value, size, 8.0), rounding.raised(value, size, 8.0)))
+        bounds = Interval.unchecked(extremes([e[0] for e in ends]).lower, extremes([e[1] for e in ends]).upper)
+        values, inside, size = self._points(a, b, s)
+        low, high = (values, values) if size is None else (
+            rounding.lowered(values, size, 4.0), rounding.raised(values, size, 4.0)
+        )  # fmt: skip
+        lower = jnp.minimum(bounds.lower, jnp.where(inside, low, jnp.inf).min(-1))
+        upper = jnp.maximum(bounds.upper, jnp.where(inside, high, -jnp.inf).max(-1))
+        return Interval.unchecked(lower, upper)
+
+    def range(self, a: Any, b: Any) -> Interval:
+        found = self._extremes(a, b, None)
+        # Without tails that grow no value lies beyond those of the table.
+        for k, side in ((0, jnp.maximum), (1, jnp.minimum)):
+            if not any(self.tails):
+                ends = np.append(self.values, self.beyond)
+                end = ends.max() if k else ends.min()
+                found = Interval.unchecked(
+                    found.lower if k else side(found.lower, end), side(found.upper, end) if k else found.upper
+                )
+        return found
+
+    def derivative(self, a: Any, b: Any) -> Interval:
+        left = np.append(-np.inf, self.knots)
+        right = np.append(self.knots, np.inf)
+        a, b = a[..., None], b[..., None]
+        met = (left < b) & (a < right) | (a == b) & (left <= b) & (a <= right)
+        lower = jnp.where(met, self.low, jnp.inf).min(-1)
+        upper = jnp.where(met, self.high, -jnp.inf).max(-1)
+        a, b = a[..., 0], b[..., 0]
+        for jump, over in zip(
+            self.jumps, ((a < self.knots[0]) & (b >= self.knots[0]), (a <= self.knots[-1]) & (b > self.knots[-1])),
+            strict=True,
+        ):  # fmt: skip
+            if jump:
+                lower, upper = jnp.where(over, -jnp.inf, lower), jnp.where(over, jnp.inf, upper)
+        return Interval.unchecked(lower, upper)
+
+    def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
+        """The slope is that of the secant; next to an infinite end that of its tail, with which the rest is bounded."""
+        low, high = jnp.isfinite(a), jnp.isfinite(b)
+        both = low & high
+        first, last = (jnp.where(both, end, other) for end, other in ((a, 0.0), (b, 1.0)))
+        wide = last - first > 1e-3 * jnp.maximum(abs(first), abs(last))
+        rise = self._at(last)[0] - self._at(first)[0]
+        inner = self.derivative(a, b)
+        middle = jnp.where(jnp.isfinite(inner.lower + inner.upper), 0.5 * inner.lower + 0.5 * inner.upper, 0)
+        s = jnp.where(wide, rise, middle) / jnp.where(wide, last - first, 1)
+        s = jnp.where(both, s, jnp.where(low, self.tails[1], self.tails[0])).astype(a.dtype)
+        usable = jnp.isfinite(s) & (low | high | (self.tails[0] == self.tails[1]))
+        s = jnp.where(usable, s, 0)
+        # An infinite end adds nothing that the last knot has not: there the rest does not change any more.
+        far = (jnp.where(low, a, jnp.minimum(self.knots[0], b)), jnp.where(high, b, jnp.maximum(self.knots[-1], a)))
+        rest = self._extremes(*far, s)
+        for end, k in ((low, 0), (high, 1)):
+            # The tail's slope is that of a segment, to within its rounding: times infinity, that is no bound.
+            exact = self.low[-k] == self.high[-k] == self.tails[k]
+            usable &= end | exact
+        return jnp.where(usable, s, 0), choose(usable, rest, natural)
+
+
+def _near(slope: Fraction, side: int, dtype: Any) -> Any:
+    """The next floating number on that side of a fraction; itself where it is one."""
+    number = np.asarray(float(slope), dtype)[()]
+    if not rounding.outward() or Fraction(float(number)) == slope:
+        return number
+    wrong = Fraction(float(number)) > slope if side < 0 else Fraction(float(number)) < slope
+    return np.nextafter(number, np.asarray(side * np.inf, dtype)) if wrong else number
+
+
+def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLinear | None:
+    """The function that a call of ``jnp.interp`` stands for, None where the table is not what it needs to be.
+
+    What the call does beyond the ends is in its body; it is found by looking at values there, and the whole is compared
+    with the body at and around all knots, so whatever else an option may do (`period`), it is not taken for a table.
+    """
+    knots, values = np.asarray(knots), np.asarray(values)
+    if knots.ndim != 1 or not (np.diff(knots) > 0).all() or not np.isfinite([knots, values]).all():
+        return None
+    body = jex.jaxpr_as_fun(eqn.params["jaxpr"])
+    aval = eqn.invars[0].aval
+
+    @jax.jit
+    @jax.vmap
+    def at(t: Any) -> Any:
+        return body(jnp.full(aval.shape, t, aval.dtype), knots, values, *others)[0].ravel()[0]
+
+    def run(points: np.ndarray) -> np.ndarray:
+        with jax.ensure_compile_time_eval():
+            return np.asarray(at(jnp.asarray(points, aval.dtype)))
+
+    span = float(knots[-1] - knots[0]) or 1.0
+    steps = np.array([2.0, 1.0, 1e-3]) * span
+    left, right = run(knots[0] - steps), run(knots[-1] + steps)
+    flat = [bool((side == side[0]).all()) for side in (left, right)]
+    if all(flat):
+        found = PiecewiseLinear.of(knots, values, (float(left[0]), float(right[0])))
+    elif not any(flat):
+        found = PiecewiseLinear.of(knots, values, extrapolates=True)
+    else:
+        return None
+    middles = 0.5 * knots[1:] + 0.5 * knots[:-1]
+    points = np.concatenate([knots, middles, knots[0] - steps, knots[-1] + steps]).astype(aval.dtype)
+    with jax.ensure_compile_time_eval(), rounding.using("nearest"):
+        ours = np.asarray(found._at(jnp.asarray(points))[0])
+    scale = 1e-5 if aval.dtype == np.float32 else 1e-11
+    return found if np.allclose(ours, run(points), rtol=scale, atol=scale * (np.abs(values).max() + 1)) else None
