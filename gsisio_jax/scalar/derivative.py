@@ -60,8 +60,11 @@ def _active(program: ScalarProgram, moving: Mask) -> set[int]:
 
 
 def _derived(program: ScalarProgram, given: list[Number], outputs: list[Any], like: Sequence[Any]) -> ScalarProgram:
-    arrays = [[collected([value], ()) for value in values] for values in ([*program.inputs, *given], outputs)]
-    return ScalarProgram(program.graph, *arrays, [number.dtype for number in like])
+    def arrays(values: Sequence[Any]) -> list[np.ndarray]:
+        return [collected([value], ()) for value in values]
+
+    dtypes = [number.dtype for number in like]
+    return ScalarProgram(program.graph, arrays([*program.inputs, *given]), arrays(outputs), dtypes)
 
 
 def _tangents(program: ScalarProgram, moving: Mask) -> ScalarProgram:

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
 
 from gsisio_jax.scalar.derivative import Mask, cotangent_program, reached, tangent_program
@@ -60,7 +61,7 @@ def _types(args: Sequence[Any], program: ScalarProgram, levels: Levels) -> list[
     types = []
     for i, dtype in enumerate(program.types):
         shape = tuple(size for size, out in zip(sizes[::-1], results[::-1], strict=True) if out[i])
-        types.append(jax.core.ShapedArray(shape, dtype))
+        types.append(ShapedArray(shape, dtype))
     return types
 
 

@@ -1,0 +1,54 @@
+"""Derivatives of scans over single numbers are those of the same scan over arrays, whatever is mapped."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gsisio_jax import scalar
+from gsisio_jax.interval.minmax import cut, larger, smaller
+from gsisio_jax.interval.primitives import scale, times
+
+RANDOM = np.random.default_rng(0)
+A, B, X = RANDOM.normal(size=3), RANDOM.normal(size=(3, 2)), RANDOM.normal(size=(3, 4))
+
+
+def body(carry, x):
+    a, b = carry
+    sorted_ = jnp.cumsum(jnp.tanh(b) * a)  # no counterpart on numbers: it stays an operation on arrays
+    near = smaller(jnp.sin(a) * b.sum(), larger(x, 0.3 * a)) + abs(a) / (2 + b[0] ** 2)
+    bounded = cut(near, scale(jnp.where(x > 5, jnp.nan, b[1]), x)) + 0.1 * times(a, x)
+    return (bounded, jnp.where(x > 0, sorted_, b * x + a)), (near * b[1], b)
+
+
+def total(scan, a, b, xs):
+    (a, b), ys = scan(body, (a, b), xs)
+    return a + 0.3 * b.sum() + ys[0].sum() + ys[1].sum()
+
+
+@pytest.mark.parametrize("axes", [(0, 0, 0), (None, 0, 0), (0, None, 0), (0, 0, None)])
+@pytest.mark.parametrize("by", [0, 1, 2])
+def test_derivatives_are_those_over_arrays(axes, by):
+    args = [v if axis == 0 else v[0] for v, axis in zip((A, B, X), axes, strict=True)]
+
+    def results(scan):
+        def mapped(*args):
+            return jax.vmap(lambda *one: total(scan, *one), axes)(*args)
+
+        def summed(*args):
+            return mapped(*args).sum()
+
+        yield mapped(*args)
+        yield jax.vmap(jax.grad(lambda *one: total(scan, *one), by), axes)(*args)
+        yield jax.grad(summed, by)(*args)
+        yield jax.jacfwd(mapped, by)(*args)
+        yield jax.jvp(jax.grad(summed, by), tuple(args), tuple(np.ones_like(v) for v in args))[1]
+
+    for ours, plain in zip(results(scalar.scan), results(jax.lax.scan), strict=True):
+        np.testing.assert_allclose(ours, plain, rtol=1e-9, atol=1e-9)
+
+
+def test_reverse_mode_keeps_only_arguments():
+    closed = jax.make_jaxpr(jax.grad(lambda a: total(scalar.scan, a, B[0], X[0])))(A[0])
+    kept = [eqn.outvars for eqn in closed.jaxpr.eqns if eqn.primitive.name == "scan"]
+    assert sum(v.aval.shape == (4,) for v in kept[0]) <= 3 + 4  # results, and what comes into a step: a, b, x
