@@ -71,11 +71,12 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
     for place, eqn in enumerate(jaxpr.eqns):
         try:
             operands, rule = [read(atom) for atom in eqn.invars], None
-            out = _recognised(known.get(place), read) if eqn.primitive.name not in _BY_HAND else None
+            match = known.get(place) if eqn.primitive.name not in _BY_HAND else None
+            out = None if match is None else _recognised(match, read)
             if out is None:
                 out = _watched(eqn, operands)
-            else:
-                rule, operands = known[place].rule, [normalised(read(atom)) for atom in known[place].operands]
+            elif match is not None:
+                rule, operands = match.rule, [read(atom) for atom in match.operands]
         except UnknownPrimitiveError as error:
             if error.place is not None or (line := _caller(eqn)) is None:
                 raise
@@ -106,7 +107,7 @@ def _watched(eqn: Any, args: Sequence[Any]) -> Any:
 
 def _recognised(match: Any, read: Callable[[Any], Any]) -> Any:
     """The value of an equation that ends a known expression."""
-    operands = [read(atom) for atom in match.operands] if match is not None else []
+    operands = [read(atom) for atom in match.operands]
     value = match.rule(*map(normalised, operands)) if any(map(is_node, operands)) else None
     return None if value is None else normalise(value)
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import is_known
-from gsisio_jax.inclusion.node import Node, is_node
+from gsisio_jax.inclusion.node import Node, is_node, normalised
 from gsisio_jax.interval.box import is_concrete
 
 MOST_OPERATIONS = 200  # that one evaluation once more may cost
@@ -143,7 +143,7 @@ class Again:
         if self._operations > MOST_OPERATIONS or not (self.allowed is None or self._keeps_entries_apart(found)):
             raise NotAgain
         if found.rule is not None:
-            results = [found.rule(*operands)]
+            results = [found.rule(*map(normalised, operands))]
             if results[0] is None:
                 raise NotAgain
         else:

@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from gsisio_jax.inclusion.form_arithmetic import box_sum, slope_image
-from gsisio_jax.inclusion.node import Form, Node, best_form, normalised, parts, slack_of, slope_of
+from gsisio_jax.inclusion.node import Node, best_form, normalised, parts, slack_of, slope_of
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like
 
