@@ -65,6 +65,11 @@ def _nearly(x):
     return jnp.where(jnp.abs(x) < 1e-6, 1.0, 1 - x**2 / 6)
 
 
+def _guarded_sinc(x):
+    small = jnp.abs(x) < 1e-6
+    return jnp.where(small, 1.0, jnp.sin(x) / jnp.where(small, 1.0, x))
+
+
 # Function, range on [-2, 3] (None: not checked), difference quotients there.
 CONTINUOUS = [
     (_dead_zone, (-1, 2), (0, 1)),
@@ -77,6 +82,7 @@ CONTINUOUS = [
     (_huber, (0, 2.5), (-1, 1)),
     (_masked, None, (-0.1, 1)),
     (_shifted, (0, 1.5), (0, 1)),
+    (_guarded_sinc, (np.sin(3) / 3, 1), (-0.436182, 0.435398)),
     (jax.nn.elu, (np.expm1(-2), 3), (np.exp(-2), 1)),
     (jax.nn.selu, None, (1.0507 * 1.67326 * np.exp(-2), 1.7581)),
     (jax.nn.leaky_relu, (-0.02, 3), (0.01, 1)),

@@ -16,7 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.node import Node, is_node, normalised
+from gsisio_jax.inclusion.origin import made_by, same
 from gsisio_jax.inclusion.rules import (
+    activations,
     bilinear,
     comparison,
     convolution,
@@ -138,6 +140,10 @@ def _dot(eqn: Any, x: Any, y: Any) -> Any:
 
 
 def _div(eqn: Any, x: Any, y: Any) -> Node:
+    sine = made_by(x, "sin")
+    if sine is not None and is_node(y) and same(sine[0], y):
+        # sin(t) / t, continued by 1 at 0; `SINC` counts in half turns, and 1 / pi is off by half an ulp.
+        return univariate.apply(activations.SINC, linear.multiple(1 / math.pi, normalised(y), rounded=True))
     quotient = bilinear.divide(x, y)
     return comparison.truncate(quotient) if jnp.issubdtype(eqn.outvars[0].aval.dtype, jnp.integer) else quotient
 
