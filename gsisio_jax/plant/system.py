@@ -7,7 +7,7 @@ y[k]   = g(x[k], u[k]) + D u[k] + H d[k] + v[k]
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.plant.periodic import Periods, check_feedthrough, check_states, read_periods, turns
 
 
 class System(eqx.Module):
@@ -31,12 +32,21 @@ class System(eqx.Module):
         state_bounds: box (n,) that every state is known to stay in (physics); all of R^n if not given.
         input_bounds: box (p,) that the unknown input is known to stay in; nothing is assumed if not given.
         m: number of known inputs, needed only where f or g takes ``u`` and both B and D are left out.
+        periodic: ``{index of an output: period}`` for outputs that are logged modulo a period, such as a heading in
+            (-pi, pi]: ``{2: 2 * math.pi}``, or 360 in degrees. g still returns the angle itself (``x[2]``, and not its
+            arctangent or remainder, which jump); a measured value stands for itself plus any multiple of the period,
+            and the observer finds which. The period is taken to be known to one unit in its last place.
+        periodic_states: ``{index of a state: period}`` for states that mean the same after a period: f and g must not
+            change but for multiples of the periods of periodic states and outputs (tried at some points). Their boxes
+            stay on the real line as long as the multiple is known; where it is lost (an unknown heading, an unbounded
+            d that turns it, a gap, a conflict) a box holds the state plus some multiple, see `wrapped` and `nearest`.
 
     Raises:
         ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
-            the wrong shape, or a bound does not fit.
+            the wrong shape, or a bound does not fit; an index or a period cannot be, an unbounded input enters a
+            periodic output, or f or g change with a periodic state.
 
-    Source: paper, (eq:system); theory 1.
+    Source: paper, (eq:system); theory 1 and 8.4.
     """
 
     f: Callable[..., Any] = eqx.field(static=True)
@@ -49,6 +59,9 @@ class System(eqx.Module):
     D: Any
     state_bounds: Interval
     input_bounds: Interval
+    periodic: Periods = eqx.field(static=True)
+    periodic_states: Periods = eqx.field(static=True)
+    turns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -61,6 +74,9 @@ class System(eqx.Module):
         state_bounds: Interval | None = None,
         input_bounds: Interval | None = None,
         m: int | None = None,
+        *,
+        periodic: Mapping[int, float] | None = None,
+        periodic_states: Mapping[int, float] | None = None,
     ):
         self.f, self.g = f, g
         self.f_takes_u, self.g_takes_u = _takes_u(f, "f"), _takes_u(g, "g")
@@ -76,8 +92,14 @@ class System(eqx.Module):
         _check_rank(self.G, self.H)
         self.state_bounds = _bounds("state_bounds", state_bounds, self.n)
         self.input_bounds = _bounds("input_bounds", input_bounds, self.p)
+        self.periodic = read_periods("periodic", periodic, self.l, "output")
+        self.periodic_states = read_periods("periodic_states", periodic_states, self.n, "state")
+        check_feedthrough(self.periodic, self.H, self.input_bounds)
+        check_states(self.periodic_states, self.state_bounds)
+        self.turns = ()
         self._check_map("f", self.dynamics, self.n)
         self._check_map("g", self.measurement, self.l)
+        self.turns = turns(self.maps, self.n, self.m, self.periodic, self.periodic_states, self.state_bounds)
 
     @property
     def n(self) -> int:
