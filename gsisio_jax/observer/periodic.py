@@ -23,7 +23,7 @@ from gsisio_jax.observer.maps import Maps
 from gsisio_jax.observer.measurement import output_box, point
 from gsisio_jax.observer.status import Source, Status
 from gsisio_jax.observer.types import Carry, StepOutput
-from gsisio_jax.plant.periodic import moved_by
+from gsisio_jax.plant.periodic import columns, moved_by
 from gsisio_jax.plant.system import Noise, System
 
 MOST_TURNS = 2.0**20
@@ -183,9 +183,7 @@ def settled(
     """
     system, dtype = maps.observer.system, y.dtype
     n, turns = system.n, np.array(system.turns).reshape(len(system.periodic), -1)
-    period = np.full(n, np.inf, dtype)
-    for i, value in system.periodic_states:
-        period[i] = value
+    period = columns(system.periodic_states, n).astype(dtype)
     tied = np.zeros((n, len(system.periodic)), int)
     tied[[i for i, _ in system.periodic_states]] = turns.T
     free = (box.width >= period) & np.isfinite(period) | ((tied != 0) & chosen.open).any(-1)

@@ -134,10 +134,10 @@ def _refuse(i: int, step: float, row: int, n: int, moved: float, unit: float | N
     )
 
 
-def _columns(periodic_states: Periods, n: int) -> np.ndarray:
-    """The period of every state, inf where it has none."""
-    period = np.full(n, np.inf)
-    for i, value in periodic_states:
+def columns(periods: Periods, size: int) -> np.ndarray:
+    """The period of every entry, inf where it has none."""
+    period = np.full(size, np.inf)
+    for i, value in periods:
         period[i] = value
     return period
 
@@ -153,14 +153,16 @@ def wrapped(system: Any, boxes: Any) -> Interval:
     Returns:
         Boxes (..., n), moved outward by the rounding of the period; infinite ones as they are.
 
-    >>> system = gx.System(lambda x: x + 1, lambda x: x, np.zeros((1, 0)), np.zeros((1, 0)), periodic_states={0: 360})
-    >>> wrapped(system, Interval([[355.0]], [[375.0]])).center.tolist()
+    >>> from gsisio_jax import System
+    >>> none = np.zeros((1, 0))
+    >>> course = System(lambda x: x + 1, lambda x: x, none, none, periodic={0: 360}, periodic_states={0: 360})
+    >>> wrapped(course, Interval([[355.0]], [[375.0]])).center.tolist()
     [[5.0]]
     """
     system, boxes = getattr(system, "system", system), getattr(boxes, "state", boxes)
     if not system.periodic_states:
         return boxes
-    period = _columns(system.periodic_states, system.n)
+    period = columns(system.periodic_states, system.n)
     return moved_by(boxes, -jnp.round(boxes.center / period), period)
 
 
@@ -187,20 +189,21 @@ def nearest(system: Any, x: Any, boxes: Interval) -> Any:
 
     Args:
         system: the plant (or an observer).
-        x: states (..., n).
+        x: states (..., n), or None.
         boxes: state boxes (..., n), or an `Estimate`.
     """
     system, boxes = getattr(system, "system", system), getattr(boxes, "state", boxes)
-    if not system.periodic_states:
+    if x is None or not system.periodic_states:
         return x
-    period = _columns(system.periodic_states, system.n)
+    period = columns(system.periodic_states, system.n)
     count = jax.lax.stop_gradient(jnp.round((boxes.center - x) / period))
     return x + count * np.where(np.isfinite(period), period, 0).astype(boxes.lower.dtype)
 
 
 def wrapped_outputs(periodic: Periods, y: Any) -> Any:
     """Outputs (l,) as a sensor logs them: periodic ones between minus and plus half a period."""
-    for j, period in periodic:
-        kind = jnp.asarray(period, y.dtype)
-        y = y.at[j].add(-kind * jnp.round(y[j] / kind))
-    return y
+    if not periodic:
+        return y
+    period = columns(periodic, y.shape[0])
+    whole = np.where(np.isfinite(period), period, 0).astype(y.dtype)
+    return y - whole * jnp.round(y / period.astype(y.dtype))
