@@ -54,8 +54,8 @@ class Alarm:
             subject = names[0] if len(names) == 1 else "the combination of " + " and ".join(names)
             return f"{subject}: the measurement lies {gap} outside of what the box of the state allows"
         if self.kind == "periodic":
-            name, gap = _pick(output_names, self.index, "output"), f"{_plain(self.gap)}{_unit(output_units, self.index)}"
-            return f"{name}: the measurement lies {gap} outside of what the box of the state allows, whole periods added"
+            name, gap = _pick(output_names, self.index, "output"), _plain(self.gap) + _unit(output_units, self.index)
+            return f"{name}: with any number of whole periods, {gap} outside of what the box of the state allows"
         if self.kind == "input":
             gap = f"{_plain(self.gap)}{_unit(input_units, self.index)}"
             return (

@@ -161,9 +161,7 @@ def contract(
     return domain, fallback, d, chosen
 
 
-def settled(
-    maps: Maps, box: Interval, chosen: Unwrapped, y: Any, u: Any, noise: Noise
-) -> tuple[Interval, Unwrapped]:
+def settled(maps: Maps, box: Interval, chosen: Unwrapped, y: Any, u: Any, noise: Noise) -> tuple[Interval, Unwrapped]:
     """Choose the multiples of periodic states anew where they are open: one period around what is measured.
 
     Any box as long as the period holds the state up to a multiple, wherever it lies; so it is laid around the value

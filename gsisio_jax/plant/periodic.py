@@ -99,28 +99,42 @@ def turns(
     """
     if not periodic_states:
         return tuple(() for _ in periodic)
-    rng = np.random.default_rng(0)
-    low, high = (np.nan_to_num(np.asarray(s, float), posinf=4, neginf=-4) for s in vars(state_bounds).values())
+    sides = (np.asarray(side, float) for side in (state_bounds.lower, state_bounds.upper))
+    low, high = (np.nan_to_num(side, posinf=4, neginf=-4) for side in sides)
     low, high = np.minimum(low, high - 1), np.maximum(high, low + 1)
-    # What may move, f above g, and by which unit.
-    period = dict(periodic_states) | {n + j: p for j, p in periodic}
+    period = dict(periodic_states) | {n + j: p for j, p in periodic}  # of what may move, f above g
     found: dict[tuple[int, int], int] = {}
-    with jax.enable_x64(True):
-        program = numpy_function(maps, np.zeros(n), np.zeros(m))
-        for _ in range(_POINTS):
-            x, u = rng.uniform(low, high), rng.uniform(0, 1, m)
-            for i, step in periodic_states:
-                there = np.array(x)
-                there[i] += step
-                before, after = np.asarray(program(x, u)), np.asarray(program(there, u))
-                for row in np.flatnonzero(np.isfinite(before) & np.isfinite(after)):
-                    unit = period.get(int(row))
-                    moved = after[row] - before[row]
-                    whole = 0 if unit is None else round(moved / unit)
-                    slack = _TOLERANCE * (1 + abs(before[row]) + abs(after[row]) + step)
-                    if abs(moved - whole * (unit or 0.0)) > slack or found.setdefault((row, i), whole) != whole:
-                        _refuse(i, step, int(row), n, float(moved), unit)
+    rng = np.random.default_rng(0)
+    try:
+        with jax.enable_x64(True):
+            program = numpy_function(maps, np.zeros(n), np.zeros(m))
+            for _ in range(_POINTS):
+                x, u = rng.uniform(low, high), rng.uniform(0, 1, m)
+                before = np.asarray(program(x, u))
+                for i, step in periodic_states:
+                    after = np.asarray(program(x + step * (np.arange(n) == i), u))
+                    _count(found, i, step, before, after, n, period)
+    except jax.errors.TracerArrayConversionError:
+        pass  # f and g hold traced numbers: taken on trust
     return tuple(tuple(found.get((n + j, i), 0) for i, _ in periodic_states) for j, _ in periodic)
+
+
+def _count(
+    found: dict[tuple[int, int], int],
+    i: int,
+    step: float,
+    before: np.ndarray,
+    after: np.ndarray,
+    n: int,
+    period: dict[int, float],
+) -> None:
+    """By how many periods every entry has moved; the same everywhere, and 0 for one that has no period."""
+    for row in map(int, np.flatnonzero(np.isfinite(before) & np.isfinite(after))):
+        unit, moved = period.get(row), float(after[row] - before[row])
+        whole = 0 if unit is None else round(moved / unit)
+        slack = _TOLERANCE * (1 + abs(before[row]) + abs(after[row]) + step)
+        if abs(moved - whole * (unit or 0.0)) > slack or found.setdefault((row, i), whole) != whole:
+            _refuse(i, step, row, n, moved, unit)
 
 
 def _refuse(i: int, step: float, row: int, n: int, moved: float, unit: float | None) -> None:
@@ -128,8 +142,8 @@ def _refuse(i: int, step: float, row: int, n: int, moved: float, unit: float | N
     allowed = "it must not change" if unit is None else f"it may change by the same multiple of {unit:g} everywhere"
     remedy = "periodic_states" if where == "f" else "periodic"
     raise ValueError(
-        f"System: state {i} is not periodic: moved by {step:g}, it changes entry {index} of {where} by {moved:g}, where "
-        f"{allowed}. If that entry is itself an angle, name it in `{remedy}`; otherwise leave the state out of "
+        f"System: state {i} is not periodic: moved by {step:g}, it changes entry {index} of {where} by {moved:g}, "
+        f"where {allowed}. If that entry is itself an angle, name it in `{remedy}`; otherwise leave the state out of "
         "`periodic_states`"
     )
 
