@@ -123,7 +123,9 @@ def design_observer(
     if not slopes.finite:
         raise NoDesignFound(
             f"design_observer: the derivatives of f or g are not bounded on the region {box}. Give a smaller region "
-            "that keeps away from points where they are infinite (a square root at 0, say)."
+            "that keeps away from points where they are infinite (a square root at 0, say). An angle that g wraps "
+            "(a remainder, or the arctangent of sine and cosine) jumps: let g return the angle itself, and name that "
+            "output in System(periodic=...)."
         )
     problem = plan.problem(slopes)
     check_rank(problem)

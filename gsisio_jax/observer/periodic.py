@@ -16,11 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, add, choose, image, nan_to_unbounded, plain_image, widened
+from gsisio_jax.interval.box import Interval, add, choose, image, is_concrete, nan_to_unbounded, plain_image, widened
 from gsisio_jax.observer.contractors import affine_rows, contract_affine_rows
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.maps import Maps
-from gsisio_jax.observer.measurement import output_box, point
+from gsisio_jax.observer.measurement import output_box, point, typed
 from gsisio_jax.observer.status import Source, Status
 from gsisio_jax.observer.types import Carry, StepOutput
 from gsisio_jax.plant.periodic import columns, moved_by
@@ -69,11 +69,10 @@ def unwrap(system: System, ranges: Interval, y: Any, u: Any, noise: Noise) -> Un
     rows, period = [j for j, _ in system.periodic], _periods(system, y.dtype)
     missing, target = ~jnp.isfinite(_at(y, rows)), _target(system, ranges, u, noise)
     seen = jnp.where(missing, 0, _at(y, rows))
-    first, last, usable = _multiples(seen, target, period)
+    first, last, near, usable = _multiples(seen, target, period)
     usable = usable & ~missing
     # Where none fits, the nearest one: what it contradicts, and by how much, is what a reader wants to know.
     none = usable & (last < first)
-    near = jnp.round(0.5 * (first + last))
     first, last = (jnp.where(usable, jnp.where(none, near, k), 0) for k in (first, last))
     middle, half = 0.5 * (first + last) * period, 0.5 * (last - first) * period
     turned, still = seen + middle, (first == 0) & (last == 0)
@@ -102,24 +101,24 @@ def _target(system: System, ranges: Interval, u: Any, noise: Noise) -> Interval:
     v = Interval.unchecked(_at(noise.v.lower, rows), _at(noise.v.upper, rows))
     parts = [ranges, v]
     if system.m:
-        parts.append(image(system.D[np.array(rows)], point(u)))
-    reached = np.flatnonzero(np.asarray(system.H)[np.array(rows)].any(0))
-    if reached.size:
-        parts.append(image(system.H[np.array(rows)][:, reached], system.input_bounds[reached]))
+        parts.append(image(jnp.asarray(_at(system.D, rows), ranges.dtype), point(u)))
+    if system.p and not (is_concrete(system.H) and not np.asarray(system.H)[np.array(rows)].any()):
+        parts.append(image(jnp.asarray(_at(system.H, rows), ranges.dtype), typed(system.input_bounds, ranges.dtype)))
     return nan_to_unbounded(add(*parts))
 
 
-def _multiples(seen: Any, target: Interval, period: np.ndarray) -> tuple[Any, Any, Any]:
-    """First and last whole number k for which ``seen + k period`` may lie in the target, and whether both are known
-    and not too large; constants for gradients."""
+def _multiples(seen: Any, target: Interval, period: np.ndarray) -> tuple[Any, Any, Any, Any]:
+    """First and last whole number k for which ``seen + k period`` may lie in the target, the one next to its middle,
+    and whether they are known and not too large; constants for gradients."""
     seen, low, high = jax.lax.stop_gradient((seen, target.lower, target.upper))
     finite = jnp.isfinite(low) & jnp.isfinite(high)
     low, high = jnp.where(finite, low, 0), jnp.where(finite, high, 0)
     eps = float(jnp.finfo(seen.dtype).eps)
     edge = (abs(seen) + abs(low) + abs(high)) * np.dtype(seen.dtype).type(_EDGE * eps)
     first, last = rounding.down((low - edge - seen) / period, 6.0), rounding.up((high + edge - seen) / period, 6.0)
+    near = jnp.round(0.5 * (first + last))
     first, last = jnp.ceil(first), jnp.floor(last)
-    return first, last, finite & (abs(first) <= MOST_TURNS) & (abs(last) <= MOST_TURNS)
+    return first, last, near, finite & (abs(first) <= MOST_TURNS) & (abs(last) <= MOST_TURNS)
 
 
 def ranges_on(maps: Maps, box: Interval, u: Any) -> Interval:
@@ -214,7 +213,9 @@ def _around(maps: Maps, box: Interval, free: Any, tied: np.ndarray, y: Any, u: A
         for r, (_, of_output) in enumerate(system.periodic):
             if abs(tied[i, r]) == 1:
                 usable = jnp.isfinite(off[r]) & ~done
-                guess = guess + jnp.where(usable, jnp.where(usable, off[r], 0) * (tied[i, r] * period / of_output), 0)
+                guess = guess + jnp.where(
+                    usable, jnp.where(usable, off[r], 0) * float(tied[i, r] * period / of_output), 0
+                )
                 done = done | usable
         entries[i] = guess
     return jnp.stack(entries)

@@ -211,7 +211,7 @@ def nearest(system: Any, x: Any, boxes: Interval) -> Any:
         return x
     period = columns(system.periodic_states, system.n)
     count = jax.lax.stop_gradient(jnp.round((boxes.center - x) / period))
-    return x + count * np.where(np.isfinite(period), period, 0).astype(boxes.lower.dtype)
+    return x + count * np.where(np.isfinite(period), period, 0).astype(jnp.result_type(x))
 
 
 def wrapped_outputs(periodic: Periods, y: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import angles
@@ -28,8 +29,13 @@ def robot():
 
 
 @pytest.fixture(scope="module")
-def free_robot():
-    return angles.made("robot", states=True)
+def dial():
+    return angles.made("dial", states=False)
+
+
+@pytest.fixture(scope="module")
+def free_dial():
+    return angles.made("dial", states=True)
 
 
 def batch(observer, initial, y, u=None, **options):
@@ -50,6 +56,11 @@ def same(a, b, tolerance):
         np.testing.assert_allclose(got, expected, rtol=tolerance, atol=tolerance)
 
 
+def held(plant, x, est):
+    """Up to whole periods, which round where they are added to the truth."""
+    return est.state.contains(np.asarray(gx.nearest(plant.observer, x, est)), -1e-12)
+
+
 def bits(est, status):
     return (np.asarray(est.status) & status) > 0
 
@@ -68,7 +79,8 @@ def bits(est, status):
 def test_boxes_are_those_of_a_log_that_was_never_wrapped(name, mode, dtype, robot):
     plant = robot if name == "robot" else angles.made(name, states=False)
     case, double = plant.case, dtype == np.float64
-    x, y, d = angles.records(plant.plain, RUNS, 1.0 if double else 0.98)
+    # To nearest, noise on its very bounds leaves gaps of an ulp, and which box is then kept is a matter of chance.
+    x, y, d = angles.records(plant.plain, RUNS, 1.0 if double and mode == "outward" else 0.98)
     assert (np.ptp(x[:, :, angles.STATES[name][0]], axis=1) > 3 * TURN).any()
     logged = angles.wrapped(y, angles.OUTPUTS[name])
     assert (abs(logged[..., angles.OUTPUTS[name]]) <= np.pi).all()
@@ -87,7 +99,7 @@ def test_boxes_are_those_of_a_log_that_was_never_wrapped(name, mode, dtype, robo
 def test_without_periods_the_log_alarms_and_then_misses(robot):
     """What `periodic` is for: at the first wrap, an alarm; after it, boxes that are a turn off."""
     case = robot.plain
-    x, y, _ = angles.records(case, 1)
+    x, y, _ = angles.records(case, RUNS)
     est = batch(robot.plain_observer, case.initial, angles.wrapped(y, (2,)), known_inputs(case))
     first = int(np.argmax(bits(est, Status.CONFLICT)[0]))
     assert bits(est, Status.CONFLICT)[0, first]
@@ -95,16 +107,6 @@ def test_without_periods_the_log_alarms_and_then_misses(robot):
     miss = np.maximum(est.state.lower - x, x - est.state.upper)[0, :, 2]
     assert miss[:first].max() <= 0
     assert miss.max() > 12.5
-
-
-def test_a_log_that_never_wraps_gives_the_same_numbers(robot):
-    """Multiple 0 costs no width at all."""
-    case = robot.plain
-    _, y, _ = angles.records(case, 1)
-    short, u = y[:, :6], known_inputs(case)[:6]
-    assert (abs(short[..., 2]) < np.pi).all()
-    found = batch(robot.observer, case.initial, short, u)
-    same(found, batch(robot.plain_observer, case.initial, short, u), 1e-14)
 
 
 def test_a_heading_turned_by_a_bounded_input():
@@ -142,41 +144,40 @@ def test_missing_entries_and_gaps(robot):
     same(found, expected, 1e-10)
 
 
-@pytest.mark.parametrize("on_conflict", ["restart", "hold"])
-def test_online_runs_equal_the_estimate(free_robot, on_conflict):
-    case, u = free_robot.case, known_inputs(free_robot.case)
-    _, y, _ = angles.records(free_robot.plain, 1)
-    logged = angles.wrapped(y, (2,))[0]
-    logged[30, 2] += 1.5
-    whole = gx.estimate(free_robot.observer, case.initial, logged, u, on_conflict=on_conflict)
+def test_online_runs_equal_the_estimate(free_dial):
+    case, u = free_dial.case, known_inputs(free_dial.case)
+    _, y, _ = angles.records(free_dial.plain, 1)
+    logged = angles.wrapped(y, (0,))[0]
+    logged[30] += 1.5
+    whole = gx.estimate(free_dial.observer, case.initial, logged, u)
     assert bits(whole, Status.CONFLICT)[30]
-    carry, out = gx.start(free_robot.observer, case.initial, logged[0], u[0], on_conflict=on_conflict)
+    carry, out = gx.start(free_dial.observer, case.initial, logged[0], u[0])
     outs = [out]
     for k in range(1, 35):
-        carry, out = gx.step(free_robot.observer, carry, logged[k], u[k], on_conflict=on_conflict)
+        carry, out = gx.step(free_dial.observer, carry, logged[k], u[k])
         outs.append(out)
-    _, out = resume(free_robot.observer, carry, logged[35:], u[35:], on_conflict=on_conflict)
-    joined = collect(free_robot.observer, [*outs, out])
+    _, out = resume(free_dial.observer, carry, logged[35:], u[35:])
+    joined = collect(free_dial.observer, [*outs, out])
     for got, expected in zip(jax.tree.leaves(joined), jax.tree.leaves(whole), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
 
 
 # None and several multiples -------------------------------------------------------------------------------------------
-def test_no_multiple_fits(robot):
+def test_no_multiple_fits(dial):
     """Half a turn off: a contradiction, of the size of what is left to the nearest multiple; and the run goes on."""
-    case, u = robot.plain, known_inputs(robot.plain)
-    x, y, _ = angles.records(case, 1)
-    logged = angles.wrapped(y, (2,))
-    logged[0, 80, 2] += np.pi
+    case, u = dial.plain, known_inputs(dial.plain)
+    x, y, _ = angles.records(case, RUNS)
+    logged = angles.wrapped(y, (0,))
+    logged[:, 80] += np.pi
     for on_conflict in ("restart", "hold"):
-        est = batch(robot.observer, case.initial, logged, u, on_conflict=on_conflict)
-        np.testing.assert_array_equal(np.flatnonzero(bits(est, Status.CONFLICT)[0]), [80])
+        est = batch(dial.observer, case.initial, logged, u, on_conflict=on_conflict)
+        assert (np.flatnonzero(bits(est, Status.CONFLICT).any(0)) == [80]).all()
+        assert bits(est, Status.CONFLICT)[:, 80].all()
         (alarm,) = jax.tree.map(lambda leaf: leaf[0], est).alarms()
         assert 2.5 < alarm.gap < np.pi
-        assert est.state.contains(x)[:, :80].all()
         # A heading that is not a periodic state stays unknown after a restart: nothing is left that knows the multiple.
-        last = est.state.width[0, 81:, 2]
-        assert np.isinf(last).all() if on_conflict == "restart" else np.isfinite(last).all()
+        width = est.state.width[:, 80:]
+        assert np.isinf(width).all() if on_conflict == "restart" else (width < 0.3).all()
         assert est.state.contains(x).all()
 
 
@@ -187,21 +188,19 @@ def test_the_alarm_of_an_angle_names_its_output():
     )
 
 
-def test_two_multiples_fit(robot):
+def test_two_multiples_fit(dial):
     """A box of more than a turn: both multiples, and all between them; then the data decide nothing any more, and the
     box stays right."""
-    case, u = robot.plain, known_inputs(robot.plain)
-    x, y, d = angles.records(case, RUNS)
-    wide = Interval([-1.0, -1.0, 0.8 - TURN], [1.0, 1.0, 0.9])
-    est = batch(robot.observer, wide, angles.wrapped(y, (2,)), u)
+    case, u = dial.plain, known_inputs(dial.plain)
+    x, y, _ = angles.records(case, RUNS)
+    wide = Interval([0.1 - TURN], [0.9])
+    est = batch(dial.observer, wide, angles.wrapped(y, (0,)), u)
     assert bits(est, Status.AMBIGUOUS)[:, 0].all()
     assert not bits(est, Status.CONFLICT | Status.MISSING).any()
     assert est.state.contains(x).all()
-    assert est.input.contains(d[:, :-1]).all()
-    v = case.noise.v
-    low, high = y[:, 0, 2] - TURN - v.upper[2], y[:, 0, 2] - v.lower[2]
-    np.testing.assert_allclose(est.state.lower[:, 0, 2], np.maximum(low, wide.lower[2]), rtol=1e-12)
-    np.testing.assert_allclose(est.state.upper[:, 0, 2], np.minimum(high, wide.upper[2]), rtol=1e-12)
+    low, high = y[:, 0] - TURN - case.noise.v.upper, y[:, 0] - case.noise.v.lower
+    np.testing.assert_allclose(est.state.lower[:, 0], np.maximum(low, wide.lower), rtol=1e-12)
+    np.testing.assert_allclose(est.state.upper[:, 0], np.minimum(high, wide.upper), rtol=1e-12)
 
 
 def test_an_unknown_heading_stays_unknown_and_harms_nothing_else(robot):
@@ -263,51 +262,51 @@ def test_multiples_against_fractions(robot, dtype, mode):
         assert (b - a) - (v[1, i] - v[0, i]) <= (spread + close if not several else spread + 2 * TURN + close)
         if len(fits) > 1:
             assert several
+        if turned == y[i] and not several:
+            assert (a, b) == (v[0, i], v[1, i])
         if slack < 0:
             assert not fits
-            gap = min(
-                max(float(exact[1] + exact[3] - t), float(t - exact[2] - exact[4]))
-                for t in (exact[0] + k * Fraction(TURN) for k in range(-20000, 20000))
-            ) if i < 60 else -slack  # fmt: skip
-            assert -slack == pytest.approx(gap, abs=close)
+            near = round(((exact[1] + exact[2]) / 2 - exact[0]) / Fraction(TURN))
+            values = [exact[0] + k * Fraction(TURN) for k in range(near - 2, near + 3)]
+            gap = min(max(exact[1] + exact[3] - value, value - exact[2] - exact[4]) for value in values)
+            assert -slack == pytest.approx(float(gap), abs=close)
         kinds.add((len(fits) > 1, bool(several), bool(slack < 0)))
     assert {(False, False, True), (False, False, False), (True, True, False)} <= kinds
 
 
-def test_too_many_turns_count_as_unknown(robot):
-    """Where the number of the turn is no whole number of the type any more, the entry says nothing."""
-    case = robot.plain
+def test_too_many_turns_count_as_unknown(dial):
+    """Where the number of the turn is no whole number of single precision any more, the entry says nothing."""
     far = MOST_TURNS * TURN * 1.5
-    initial = Interval([-1.0, -1.0, far], [1.0, 1.0, far + 0.1])
-    y = angles.wrapped([[0.0, 0.0, far + 0.05]], (2,))
-    est = gx.estimate(robot.observer, initial, y, np.zeros((1, 1)))
+    initial = Interval([far], [far + 0.1])
+    est = gx.estimate(dial.observer, initial, angles.wrapped([[far + 0.05]], (0,)), np.zeros((1, 1)))
     assert bits(est, Status.AMBIGUOUS).all()
-    np.testing.assert_allclose(est.state.lower[0, 2], far)
-    assert not bits(est, Status.CONFLICT).any()
-    assert case.system.periodic == ()
+    assert not bits(est, Status.CONFLICT | Status.MISSING).any()
+    np.testing.assert_allclose(est.state.lower[0], initial.lower)
+    np.testing.assert_allclose(est.state.upper[0], initial.upper)
 
 
 # Periodic states ------------------------------------------------------------------------------------------------------
-def test_a_periodic_state_changes_nothing_while_the_turn_is_known(free_robot, robot):
-    case, u = robot.plain, known_inputs(robot.plain)
-    _, y, _ = angles.records(case, 2)
-    logged = angles.wrapped(y, (2,))
-    same(batch(free_robot.observer, case.initial, logged, u), batch(robot.observer, case.initial, logged, u), 0.0)
+def test_a_periodic_state_changes_nothing_while_the_turn_is_known(free_dial, dial):
+    case, u = dial.plain, known_inputs(dial.plain)
+    _, y, _ = angles.records(case, RUNS)
+    logged = angles.wrapped(y, (0,))
+    same(batch(free_dial.observer, case.initial, logged, u), batch(dial.observer, case.initial, logged, u), 1e-13)
 
 
 @pytest.mark.parametrize("heading", [(-np.inf, np.inf), (-np.pi, np.pi), (3.0, np.inf)])
-def test_an_unknown_heading_is_found(free_robot, heading):
+def test_an_unknown_heading_is_found(free_dial, heading):
     """At the first measurement, up to whole turns."""
-    case, u = free_robot.plain, known_inputs(free_robot.plain)
-    x, y, d = angles.records(case, RUNS)
-    initial = Interval([-1.0, -1.0, heading[0]], [1.0, 1.0, heading[1]])
-    est = batch(free_robot.observer, initial, angles.wrapped(y, (2,)), u)
+    case, u = free_dial.plain, known_inputs(free_dial.plain)
+    x, y, _ = angles.records(case, RUNS)
+    if heading[0] == -np.pi:  # near the cut, where two multiples fit
+        x, y = x + 2.8, y + 2.8
+    logged = angles.wrapped(y, (0,))
+    est = batch(free_dial.observer, Interval([heading[0]], [heading[1]]), logged, u)
     assert not bits(est, Status.CONFLICT | Status.AMBIGUOUS | Status.UNBOUNDED).any()
-    assert est.state.contains(np.asarray(gx.nearest(free_robot.observer, x, est))).all()
-    assert est.input.contains(d[:, :-1]).all()
-    known = batch(free_robot.observer, case.initial, angles.wrapped(y, (2,)), u)
-    np.testing.assert_allclose(est.state.width[:, 1:], known.state.width[:, 1:], atol=1e-9)
-    assert (est.state.width[:, 0, 2] <= 0.0901).all()
+    assert held(free_dial, x, est).all()
+    known = batch(free_dial.observer, Interval([0.2], [3.6]), logged, u)
+    np.testing.assert_allclose(est.state.width[:, 5:], known.state.width[:, 5:], atol=1e-9)
+    assert (est.state.width[:, 0] <= 0.0901).all()
 
 
 def test_a_heading_that_any_input_turns():
@@ -320,129 +319,131 @@ def test_a_heading_that_any_input_turns():
     logged = angles.wrapped(y, angles.OUTPUTS["bearings"])
     logged[:, 10], logged[:, 20, 1], logged[:, 30, 3] = np.nan, np.nan, np.nan
     est = batch(plant.observer, case.initial, logged)
-    assert est.state.contains(np.asarray(gx.nearest(case.system, x, est))).all()
+    assert held(plant, x, est).all()
     assert est.input.contains(d[:, :-1]).all()
     assert not bits(est, Status.CONFLICT).any()
     assert np.isinf(est.input.width[..., 0]).all()
     assert (np.delete(est.state.width[..., 2], 10, 1) < 1.0).all()
-    # Without the declaration of the state it is lost for good at the first step.
-    lost = angles.made("bearings", states=False)
-    est = batch(lost.observer, case.initial, logged)
-    assert est.state.contains(x).all()
-    assert np.isinf(est.state.width[:, 1:, 2]).all()
 
 
-def test_a_restart_finds_the_heading_again(free_robot):
-    case, u = free_robot.plain, known_inputs(free_robot.plain)
+def test_a_restart_finds_the_heading_again(free_dial):
+    case, u = free_dial.plain, known_inputs(free_dial.plain)
     x, y, _ = angles.records(case, RUNS)
-    logged = angles.wrapped(y, (2,))
-    logged[:, 80, 2] += np.pi
-    est = batch(free_robot.observer, case.initial, logged, u)
-    assert (np.flatnonzero(bits(est, Status.CONFLICT)[0]) == [80, 81]).all()  # the lie, and what contradicts it
-    inside = est.state.contains(np.asarray(gx.nearest(free_robot.observer, x, est))).all((0, 2))
-    assert np.delete(inside, 80).all()
-    assert (est.state.width[:, 81:, 2] < 0.2).all()
+    logged = angles.wrapped(y, (0,))
+    logged[:, 80] += np.pi
+    est = batch(free_dial.observer, case.initial, logged, u)
+    # The lie, and what contradicts it, once it is believed.
+    np.testing.assert_array_equal(np.flatnonzero(bits(est, Status.CONFLICT).any(0)), [80, 81])
+    inside = held(free_dial, x, est)
+    assert np.delete(inside, 80, axis=1).all()
+    assert not inside[:, 80].any()
+    assert (est.state.width < 0.7).all()
 
 
-def test_far_from_zero_the_box_moves_back(free_robot):
+def test_a_gap_of_everything_loses_the_turn_and_not_the_heading(free_dial):
+    """Noise of 40 steps of .2 per side: the box is longer than a turn, and is kept at one."""
+    case, u = free_dial.plain, known_inputs(free_dial.plain)
+    x, y, _ = angles.records(case, RUNS)
+    logged = angles.wrapped(y, (0,))
+    logged[:, 20:60] = np.nan
+    noise = gx.Noise(Interval([-0.2], [0.2]), case.noise.v)
+    est = batch(free_dial.observer, case.initial, logged, u, noise=noise)
+    assert (est.state.width <= TURN + 1e-9).all()
+    assert (est.state.width[:, 59] > TURN - 1e-9).all()
+    assert (est.state.width[:, 60:] < 0.1).all()
+    assert not bits(est, Status.CONFLICT | Status.UNBOUNDED).any()
+    assert held(free_dial, x, est).all()
+
+
+def test_far_from_zero_the_box_moves_back(free_dial):
     """100 turns on, and with single precision: numbers stay small, so digits are not lost."""
-    case, u = free_robot.plain, known_inputs(free_robot.plain)
-    x, y, d = angles.records(case, RUNS, 0.98)
-    far, slip = np.array([0.0, 0.0, 100 * TURN]), np.array([0.0, 0.0, 1e-3])
-    initial = Interval(case.initial.lower + far - slip, case.initial.upper + far + slip)
-    logged = angles.wrapped(y, (2,)).astype(np.float32)
-    est = batch(free_robot.observer, initial.astype(np.float32), logged, np.float32(u))
-    assert (abs(est.state.center[..., 2]) < 65 * TURN).all()
-    assert (abs(est.state.center[:, 0, 2]) < 2).all()
-    assert est.state.contains(np.asarray(gx.nearest(case.system, x, est))).all()
-    assert est.input.contains(d[:, :-1]).all()
+    case, u = free_dial.plain, known_inputs(free_dial.plain)
+    x, y, _ = angles.records(case, RUNS, 0.98)
+    initial = Interval(case.initial.lower + 100 * TURN - 1e-3, case.initial.upper + 100 * TURN + 1e-3)
+    logged = angles.wrapped(y, (0,)).astype(np.float32)
+    est = batch(free_dial.observer, initial.astype(np.float32), logged, np.float32(u))
+    assert est.state.lower.dtype == np.float32
+    assert (abs(est.state.center[:, 0]) < 2).all()
+    assert (abs(est.state.center) < 50).all()
+    assert held(free_dial, x, est).all()
     assert not bits(est, Status.CONFLICT | Status.AMBIGUOUS).any()
 
 
-def test_boxes_for_display(free_robot):
-    system = free_robot.case.system
-    boxes = Interval([[0.0, 1.0, 40.0], [0.0, 1.0, -np.inf], [9.0, 9.0, 3.0]], [[1.0, 2.0, 40.5], [1, 2, 3], [9, 9, 4]])
-    found = gx.wrapped(free_robot.observer, boxes)
-    turns = [[6], [0], [1]]
-    for got, side, towards in ((found.lower, boxes.lower, -9e9), (found.upper, boxes.upper, 9e9)):
-        np.testing.assert_array_equal(np.asarray(got)[:, :2], np.asarray(side)[:, :2])
-        exact = [
-            side[i, 2] if np.isinf(side[i, 2]) else float(Fraction(side[i, 2]) - turns[i][0] * Fraction(TURN))
-            for i in range(3)
-        ]
-        np.testing.assert_allclose(np.asarray(got)[:, 2], exact, rtol=1e-13)
-        beyond = np.asarray(got)[[0, 2], 2] - np.take(exact, [0, 2])
-        assert (beyond * np.sign(towards) > 0).all()
-    x = np.array([[0.5, 1.5, 40.2 - 5 * TURN], [0.5, 1.5, 2.0], [9.0, 9.0, 3.5 + 9 * TURN]])
-    assert boxes.contains(np.asarray(gx.nearest(system, x, boxes))).all()
-    assert gx.wrapped(free_robot.plain.system, boxes) is boxes
-    assert gx.nearest(free_robot.plain.system, x, boxes) is x
+def test_boxes_for_display(free_dial):
+    """Moved by whole periods, outward; what is infinite or not periodic stays."""
+    boxes = Interval([[40.0], [-np.inf], [3.0], [1.0], [-41.0]], [[40.5], [3.0], [4.0], [2.0], [-35.0]])
+    found = gx.wrapped(free_dial.observer, boxes)
+    turns = np.array([6, 0, 1, 0, -6])
+    for got, side, outward in ((found.lower, boxes.lower, -1), (found.upper, boxes.upper, 1)):
+        for value, before, count in zip(np.asarray(got)[:, 0], np.asarray(side)[:, 0], turns, strict=True):
+            if np.isinf(before) or count == 0:
+                assert value == before
+                continue
+            for period in (np.nextafter(TURN, 0), TURN, np.nextafter(TURN, 9)):
+                exact = Fraction(float(before)) - int(count) * Fraction(float(period))
+                assert 0 < outward * (Fraction(float(value)) - exact) < 1e-13
+    x = np.array([[40.2 - 5 * TURN], [2.0], [3.5 + 9 * TURN], [1.5], [-38.0 + TURN]])
+    assert boxes.contains(np.asarray(gx.nearest(free_dial.observer, x, boxes))).all()
+    plain = free_dial.plain.system
+    assert gx.wrapped(plain, boxes) is boxes
+    assert gx.nearest(plain, x, boxes) is x
 
 
 # Elsewhere ------------------------------------------------------------------------------------------------------------
-def test_gradients(free_robot, robot):
-    """Of the widths and centers, by noise bounds, initial box and record: central differences, and finite where no
-    multiple or several fit."""
-    case = robot.plain
+def test_gradients(free_dial):
+    """Of all sides, by noise bounds, initial box and record: central differences, and finite where no multiple or
+    several fit."""
+    case, steps = free_dial.plain, 40
     _, y, _ = angles.records(case, 1)
-    steps = 30
-    logged, u = angles.wrapped(y, (2,))[0, :steps], known_inputs(case)[:steps]
-    assert (abs(np.diff(logged[:, 2])) > 5).any()
-    weights = np.random.default_rng(1).normal(size=(2, steps, 3))
+    logged, u = angles.wrapped(y, (0,))[0, :steps], known_inputs(case)[:steps]
+    assert (abs(np.diff(logged[:, 0])) > 5).any()
+    weights = np.random.default_rng(1).normal(size=(2, steps, 1))
 
-    def total(scale, shift, y, observer, initial):
+    def total(scale, shift, y, initial):
         noise = jax.tree.map(lambda side: scale * side, case.noise)
         box = Interval.unchecked(initial.lower - shift, initial.upper + shift)
-        est = gx.estimate(observer, box, y, u, noise)
+        est = gx.estimate(free_dial.observer, box, y, u, noise)
         finite = [jnp.where(jnp.isfinite(side), side, 0) for side in (est.state.lower, est.state.upper)]
         return (weights[0] * finite[0]).sum() + (weights[1] * finite[1]).sum()
 
-    gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2)), static_argnames=())
-    point, value = (1.1, 0.01, logged), jax.jit(total)
-    args = robot.observer, case.initial
-    found, h = gradient(*point, *args), 1e-6
-    direction = np.random.default_rng(2).normal(size=logged.shape)
-    for i, (slope, step) in enumerate(zip(found, (1.0, 1.0, direction), strict=True)):
-        there = [tuple(p + s * h * step if j == i else p for j, p in enumerate(point)) for s in (1, -1)]
-        central = (value(*there[0], *args) - value(*there[1], *args)) / (2 * h)
-        assert (np.asarray(slope) * step).sum() == pytest.approx(float(central), rel=1e-5, abs=1e-6)
     off = logged.copy()
-    off[3, 2], off[9, 2], off[12] = off[3, 2] + np.pi, np.nan, np.nan
-    unknown = Interval(np.array([-1.0, -1.0, -np.inf]), np.array([1.0, 1.0, np.inf]))
-    for observer in (robot.observer, free_robot.observer):
-        for initial, y in ((case.initial, off), (unknown, logged)):
-            for leaf in jax.tree.leaves(gradient(1.1, 0.01, y, observer, initial)):
-                assert np.isfinite(leaf).all()
+    off[3], off[9] = off[3] + np.pi, np.nan
+    unknown = Interval(np.array([-np.inf]), np.array([np.inf]))
+    direction = np.random.default_rng(2).normal(size=logged.shape)
+    value, gradient, h = jax.jit(total), jax.jit(jax.grad(total, argnums=(0, 1, 2))), 1e-6
+    for initial, y in ((case.initial, logged), (case.initial, off), (unknown, logged)):
+        point = (1.1, 0.01, y)
+        found = gradient(*point, initial)
+        assert all(np.isfinite(leaf).all() for leaf in found)
+        for i, step in enumerate((1.0, 1.0, direction)):
+            there = [tuple(p + s * h * step if j == i else p for j, p in enumerate(point)) for s in (1, -1)]
+            central = float((value(*there[0], initial) - value(*there[1], initial)) / (2 * h))
+            assert (np.asarray(found[i]) * step).sum() == pytest.approx(central, rel=1e-5, abs=1e-6)
 
 
-def test_simulated_records_are_wrapped(free_robot):
-    case = free_robot.case
-    plain, d = free_robot.plain.simulate(jax.random.key(1))
-    run, _ = case.simulate(jax.random.key(1))
+def test_simulated_records_are_wrapped(free_dial):
+    plain, _ = free_dial.plain.simulate(jax.random.key(1))
+    run, _ = free_dial.case.simulate(jax.random.key(1))
     np.testing.assert_array_equal(run.x, plain.x)
-    np.testing.assert_array_equal(run.y[:, :2], plain.y[:, :2])
-    np.testing.assert_allclose(run.y[:, 2], angles.wrapped(plain.y, (2,))[:, 2], atol=1e-13)
-    assert np.ptp(plain.y[:, 2]) > 3 * TURN
-    assert d.shape == (200, 2)
+    assert np.ptp(plain.y) > 3 * TURN
+    np.testing.assert_allclose(run.y, angles.wrapped(plain.y, (0,)), atol=1e-13)
 
 
-def test_studies(free_robot):
+def test_studies(free_dial):
     """`monte_carlo` wraps what it simulates, and both compare a truth up to whole turns."""
-    case, u = free_robot.case, known_inputs(free_robot.case)
-    unknown = Interval([-1.0, -1.0, -np.inf], [1.0, 1.0, np.inf])
-    usual = {"key": 2, "runs": 20, "steps": 60, "x0": case.initial, "u": u[:60], "progress": False}
+    case, u = free_dial.case, known_inputs(free_dial.case)
+    unknown = Interval([-np.inf], [np.inf])
     runs = gx.monte_carlo(
-        free_robot.observer, d=lambda key, k, x: jax.random.normal(key, (2,)), draw="vertices", initial=unknown,
-        reduce=("final", "status"), **usual,
+        free_dial.observer, 2, 20, 60, x0=case.initial, initial=unknown, u=u[:60], draw="vertices",
+        reduce=("final", "status"), progress=False,
     )  # fmt: skip
     assert runs.attrs["missed"].startswith("0 of 20")
-    assert (runs.state_width_final.sel(state="x3") < 0.2).all()
-    x, y, d = angles.records(free_robot.plain, 3)
+    assert (runs.state_width_final < 0.2).all()
+    x, y, d = angles.records(free_dial.plain, 3)
     study = gx.sweep(
-        free_robot.observer, unknown, angles.wrapped(y, (2,)), u=u, truth=(x, d), reduce=("coverage",), progress=False
+        free_dial.observer, unknown, angles.wrapped(y, (0,)), u=u, truth=(x, d), reduce=("coverage",), progress=False
     )
     assert (study.state_coverage == 1).all()
-    assert (study.input_coverage == 1).all()
 
 
 def test_the_prediction_form():
@@ -477,7 +478,7 @@ ERRORS = {
     "word": ({"periodic": {2: "2 pi"}}, "positive, finite period.*got '2 pi'"),
     "in degrees": ({"periodic": {2: 360}, "periodic_states": {2: 360}}, "state 2 is not periodic: .* entry [01] of f"),
     "output left out": ({"periodic_states": {2: TURN}}, "state 2 is not periodic: .* changes entry 2 of g by 6.28.*"),
-    "no angle": ({"periodic": {0: TURN}, "periodic_states": {0: 1.0}}, "state 0 is not periodic: .* entry 0 of f"),
+    "no angle": ({"periodic": {0: TURN}, "periodic_states": {0: 1.0}}, "state 0 is not periodic: .* entry 0 of g by 1, where"),
 }  # fmt: skip
 
 
