@@ -130,4 +130,4 @@ def records(case: Case, count: int, share: float = 1.0) -> tuple[np.ndarray, np.
     noise = jax.tree.map(lambda side: share * side, case.noise)
     keys = jax.random.split(jax.random.key(7), count)
     runs, d = jax.vmap(lambda key: case.simulate(key, noise))(keys)
-    return np.asarray(runs.x)[:, :-1], np.asarray(runs.y), np.asarray(d)
+    return np.array(runs.x)[:, :-1], np.array(runs.y), np.array(d)
