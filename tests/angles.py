@@ -131,3 +131,30 @@ def records(case: Case, count: int, share: float = 1.0) -> tuple[np.ndarray, np.
     keys = jax.random.split(jax.random.key(7), count)
     runs, d = jax.vmap(lambda key: case.simulate(key, noise))(keys)
     return np.array(runs.x)[:, :-1], np.array(runs.y), np.array(d)
+
+
+def batch(observer, initial, y, u=None, **options):
+    """`estimate` of many records, in NumPy."""
+
+    def one(y):
+        return gx.estimate(observer, initial, y, u, **options)
+
+    return jax.tree.map(np.asarray, jax.vmap(one)(y))
+
+
+def known_inputs(case, dtype=np.float64) -> Any:
+    return np.asarray(case.u(case.steps), dtype) if case.system.m else None
+
+
+def same(a, b, tolerance):
+    for got, expected in zip(jax.tree.leaves((a.state, a.input)), jax.tree.leaves((b.state, b.input)), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=tolerance, atol=tolerance)
+
+
+def held(plant, x, est):
+    """Up to whole periods, which round where they are added to the truth."""
+    return est.state.contains(np.asarray(gx.nearest(plant.observer, x, est)), -1e-12)
+
+
+def bits(est, status):
+    return (np.asarray(est.status) & status) > 0
