@@ -40,6 +40,7 @@ class System(eqx.Module):
             change but for multiples of the periods of periodic states and outputs (tried at some points). Their boxes
             stay on the real line as long as the multiple is known; where it is lost (an unknown heading, an unbounded
             d that turns it, a gap, a conflict) a box holds the state plus some multiple, see `wrapped` and `nearest`.
+            Needs `periodic` outputs (there is nothing to choose without them), and acts in the current form.
 
     Raises:
         ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
