@@ -13,6 +13,7 @@ from gsisio_jax.observer.estimation import Estimate, estimate, start, step
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.status import Status
 from gsisio_jax.observer.types import Carry, Observer, StepOutput
+from gsisio_jax.plant.periodic import nearest, wrapped
 from gsisio_jax.plant.simulation import Simulation, simulate
 from gsisio_jax.plant.system import Noise, System
 
@@ -51,6 +52,7 @@ __all__ = [
     "intersect",
     "linear_image",
     "monte_carlo",
+    "nearest",
     "paper",
     "plot",
     "simulate",
@@ -61,6 +63,7 @@ __all__ = [
     "tune_noise",
     "tuning",
     "width_sensitivity",
+    "wrapped",
 ]
 
 _LAZY = {

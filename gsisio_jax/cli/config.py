@@ -16,10 +16,12 @@ from .study_config import MonteCarloPart, SweepPart
 
 
 class SystemPart(Part):
-    """Where the System comes from."""
+    """Where the System comes from, and the periods of the outputs and states that are angles, by name."""
 
     use: Reference
     arguments: dict[str, Any] = Field(default_factory=dict)
+    periodic: dict[str, Number] = Field(default_factory=dict)
+    periodic_states: dict[str, Number] = Field(default_factory=dict)
 
 
 class Signal(Part):

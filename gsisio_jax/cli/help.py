@@ -17,7 +17,8 @@ The built-in examples are commented and meant to be copied.
 
 estimate writes three files: a labelled NetCDF, a CSV with the columns
 time,<signal>_lower,<signal>_upper,...,status  and a PNG. status is a sum of
-1 conflict (a certified alarm), 2 missing data, 4 unbounded, 8 outside the region, 16 crossed.
+1 conflict (a certified alarm), 2 missing data, 4 unbounded, 8 outside the region, 16 crossed,
+32 ambiguous (several multiples of the period of an angle fit).
 
 exit codes: 0 done, 1 a simulated run was not held by its boxes (monte-carlo), 2 something in the
 command, the configuration, the table or the folder is wrong (one line says what, and no file is

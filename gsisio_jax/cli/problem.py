@@ -122,7 +122,7 @@ def build_problem(config: Config, file: str) -> Problem:
     }
     _check_unique(groups, file)
     return Problem(
-        system=system,
+        system=_with_periods(system, config, groups, file),
         noise=Noise(w=box("noise.w", config.noise.w, "states"), v=box("noise.v", config.noise.v, "outputs")),
         region=region,
         u_region=None if config.u_region is None else box("u_region", config.u_region, "known inputs"),
@@ -151,6 +151,30 @@ def _system(config: Config, file: str) -> Any:
     elif arguments:
         raise UserError(f"{file}: system.arguments are given, but {reference} is a System and takes none")
     return found
+
+
+def _with_periods(system: Any, config: Config, groups: dict[str, Names], file: str) -> Any:
+    """The system with the periodic outputs and states of the file, where it names some."""
+
+    def by_index(key: str, group: str, given: dict[str, float], own: Any) -> dict[int, float]:
+        names = groups[group].names
+        for name in given:
+            if name not in names:
+                raise UserError(f"{file}: system.{key}: there is no {group} {name}; they are: {', '.join(names)}")
+        return {names.index(name): period for name, period in given.items()} or dict(own)
+
+    part = config.system
+    if not (part.periodic or part.periodic_states):
+        return system
+    outputs = by_index("periodic", "output", part.periodic, system.periodic)
+    states = by_index("periodic_states", "state", part.periodic_states, system.periodic_states)
+    try:
+        return System(
+            system.f, system.g, system.G, system.H, system.B, system.D, system.state_bounds, system.input_bounds,
+            system.m, periodic=outputs, periodic_states=states,
+        )  # fmt: skip
+    except ValueError as error:
+        raise UserError(f"{file}: system: {reason(error)}") from error
 
 
 def _check_unique(groups: dict[str, Names], file: str) -> None:

@@ -86,7 +86,8 @@ def design_observer(
             takes none of `gains`, `missing` and `sweeps`.
         gains: size of the bank: the certified gain, and ``gains - 1`` more that are best for larger boxes.
         u_region: box (m,) of known inputs for which the design holds; needed where f or g takes u.
-        missing: also keep gains for steps where entries of y[k] or y[k-1] are missing.
+        missing: also keep gains for steps where entries of y[k] or y[k-1] are missing. A system with periodic outputs
+            always has them.
         sweeps: contractions per step; more are tighter and slower.
         bounds: how f and g are bounded online, any of "affine", "natural", "decomposition", "remainder", "mean_value",
             "abstraction" (planes found offline, valid on the region); the bounds are intersected (paper, Corollary 1).
@@ -128,8 +129,8 @@ def design_observer(
     first = first_gain(plan, slopes_on, box, certify)
     problem, main = first.problem, first.gain
     bank = [main, *profile_bank(problem, main, box, gains - 1)]
-    if missing:
-        bank.extend(gains_for_missing(problem, main, box, feedthrough))
+    if missing or system.periodic:  # the multiple of a periodic output is chosen without that output
+        bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
     bank = distinct(bank)
     steady = problem.steady_width(bank[0])
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)

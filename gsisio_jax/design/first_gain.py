@@ -6,7 +6,7 @@ finite at all. Where only the promise is lost, the design goes on without it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,11 +60,12 @@ def first_gain(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Inte
     problem = plan.problem(slopes) if slopes.finite else plan.problem(_at_center(plan, region, slopes))
     if not slopes.finite:
         found = _culprits(plan, region)
-        uncertified = "no width is promised: " + "; ".join(map(str, found))
+        reason = "; ".join(map(str, found)) + _wraps(found)
+        uncertified = f"no width is promised: {reason}"
         if certify and not (found and all(c.fault == "may jump" for c in found)):
             raise NoDesignFound(
                 f"design_observer: the derivatives of f or g are not bounded on the region {region}: "
-                f"{'; '.join(map(str, found))}. Give a region (or `state_bounds`) that keeps away from such points, or "
+                f"{reason}. Give a region (or `state_bounds`) that keeps away from such points, or "
                 f"design without a certificate: certify=False.{_scaled(plan, slopes_on, region)}"
             )
     try:
@@ -83,6 +84,16 @@ def _culprits(plan: Plan, region: Interval) -> list[Culprit]:
     with jax.enable_x64(True):
         box, known = (Interval(*(np.asarray(s, np.float64) for s in (b.lower, b.upper))) for b in (region, u))
         return [c for function in (system.dynamics, system.measurement) for c in culprits(function, box, known)]
+
+
+def _wraps(found: Sequence[Culprit]) -> str:
+    """A hint for angles that g wraps."""
+    if not any(c.operation in ("atan2", "remainder", "rem", "floor") for c in found):
+        return ""
+    return (
+        ". An angle that g wraps (a remainder, or the arctangent of sine and cosine) jumps: let g return the angle "
+        "itself, and name that output in System(periodic=...)"
+    )
 
 
 def _at_center(plan: Plan, region: Interval, slopes: Slopes) -> Slopes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from itertools import combinations
 
 import numpy as np
@@ -73,9 +74,9 @@ def profile_bank(problem: GainProblem, main: np.ndarray, region: Interval, count
 
 
 def gains_for_missing(
-    problem: GainProblem, main: np.ndarray, region: Interval, feedthrough: Feedthrough
+    problem: GainProblem, main: np.ndarray, region: Interval, feedthrough: Feedthrough, together: Collection[int] = ()
 ) -> list[np.ndarray]:
-    """Gains for steps in which y[k-1] or entries of y[k] are missing (theory 8)."""
+    """Gains for steps in which y[k-1] or entries of y[k] are missing, also all those `together` (theory 8)."""
     l, q = problem.l, problem.q
     width = np.asarray(region.width)
     steady = problem.steady_width(main)
@@ -86,6 +87,8 @@ def gains_for_missing(
         present = [set(kept) for size in range(l + 1) for kept in combinations(range(l), size)]
     else:
         present = [set(), *(set(range(l)) - {j} for j in range(l)), set(range(l))]
+        if 1 < len(together) < l:
+            present.append(set(range(l)) - set(together))
     found = []
     for before in (False, True):
         for kept in present:

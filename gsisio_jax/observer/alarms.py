@@ -18,10 +18,11 @@ class Alarm:
     Attributes:
         step: index k.
         kind: which intersection was empty: "initial" (initial box and state bounds), "output" (a measurement and the
-            box), "state" (the box carried from the past and the box so far), "dynamics", "input", "certificate", or
-            "balance" (a combination of dynamics and outputs that no unknown input can explain).
-        index: the component: a state, a row of T2, an input, or a circuit of [G; H].
-        outputs: the outputs that enter that row, for kind "output".
+            box), "state" (the box carried from the past and the box so far), "dynamics", "input", "certificate",
+            "balance" (a combination of dynamics and outputs that no unknown input can explain), or "periodic" (no
+            multiple of its period brings a periodic output to where the box is).
+        index: the component: a state, a row of T2, an input, a circuit of [G; H], or an output (kind "periodic").
+        outputs: the outputs that enter that row, for kinds "output" and "periodic".
         gap: by how much the two pieces miss each other, in the unit of the component.
 
     Source: theory 8.
@@ -52,6 +53,9 @@ class Alarm:
             gap = f"{_plain(self.gap)}{_unit(output_units, self.outputs[0]) if len(self.outputs) == 1 else ''}"
             subject = names[0] if len(names) == 1 else "the combination of " + " and ".join(names)
             return f"{subject}: the measurement lies {gap} outside of what the box of the state allows"
+        if self.kind == "periodic":
+            name, gap = _pick(output_names, self.index, "output"), _plain(self.gap) + _unit(output_units, self.index)
+            return f"{name}: with any number of whole periods, {gap} outside of what the box of the state allows"
         if self.kind == "input":
             gap = f"{_plain(self.gap)}{_unit(input_units, self.index)}"
             return (
@@ -79,7 +83,7 @@ def read_alarms(status: Any, margin: Any, source: Any, output_rows: Sequence[tup
     alarms = []
     for k in np.flatnonzero(status & Status.CONFLICT):
         kind, index = Source(int(source[k]) // SOURCE_STRIDE), int(source[k]) % SOURCE_STRIDE
-        outputs = tuple(output_rows[index]) if kind is Source.OUTPUT else ()
+        outputs = tuple(output_rows[index]) if kind is Source.OUTPUT else (index,) if kind is Source.PERIODIC else ()
         alarms.append(Alarm(int(k), kind.name.lower(), index, outputs, float(-margin[k])))
     return alarms
 

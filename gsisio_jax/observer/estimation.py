@@ -27,7 +27,8 @@ class Estimate(eqx.Module):
     """Boxes of a record; a pytree. Under `jax.vmap` every array gains the batch axes in front.
 
     Attributes:
-        state: box of x[k] from y[0..k], (T, n); from y[0..k-1] in the prediction form.
+        state: box of x[k] from y[0..k], (T, n); from y[0..k-1] in the prediction form. Of a periodic state up to a
+            multiple of its period (`gsisio_jax.wrapped`, `gsisio_jax.nearest`).
         input: box of d[k] from y[0..k+1], (T-1, p).
         current_input: box of V1' d[k] from y[0..k], (T, p_H).
         status: `Status` bit mask, (T,).

@@ -12,6 +12,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.intersection import bound
@@ -24,6 +25,7 @@ from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.domain import Domain, largest_magnitude
 from gsisio_jax.observer.measurement import in_box, inside, output_box
+from gsisio_jax.observer.periodic import unwrap
 from gsisio_jax.observer.status import Source, Status, bit_mask
 from gsisio_jax.observer.types import Carry, StepOutput, cast
 from gsisio_jax.plant.system import Noise, System
@@ -141,15 +143,23 @@ def _finish(
         d = choose(domain.conflict, system.input_bounds, d)
     x = choose(domain.conflict, system.state_bounds, domain.box)
     h = bound(system.maps, observer.bounds, observer.abstraction, observer.derivative)(_sorted(x), u)
+    missing, ambiguous = ~jnp.isfinite(y).all(), []
+    if system.periodic:  # y[k] does not enter the box of x[k], so that box tells the multiple
+        outputs = h.range[np.array([system.n + j for j, _ in system.periodic])]
+        seen = unwrap(system, outputs, y, u, noise)
+        domain = domain.record_margin(seen.slack, Source.PERIODIC)
+        y, noise = jnp.where(seen.slack < 0, jnp.nan, seen.y), seen.noise
+        ambiguous = [(seen.open.any(), Status.AMBIGUOUS)]
     applies = in_box(u, observer.u_region)
     if certificate.region_matters:
         applies = applies & inside(choose(carry.starts, x, carry.state), certificate.region)
     bits = (
         (domain.conflict, Status.CONFLICT),
-        (~jnp.isfinite(y).all(), Status.MISSING),
+        (missing, Status.MISSING),
         (~(jnp.isfinite(x.lower) & jnp.isfinite(x.upper)).all(), Status.UNBOUNDED),
         (~applies, Status.OUTSIDE_REGION),
         ((x.lower > x.upper).any() | (d.lower > d.upper).any(), Status.CROSSED),
+        *ambiguous,
     )
     d1 = _current_input(observer.current, h, _sorted(x), output_box(system, y, u, noise.v))
     after = Carry(x, h, y, u, noise, jnp.asarray(False), jnp.asarray(True))

@@ -22,6 +22,7 @@ class Status(enum.IntFlag):
     UNBOUNDED = 4  # some side of the state box is infinite
     OUTSIDE_REGION = 8  # boxes are certain, but the width promise does not apply
     CROSSED = 16  # prediction form only: the printed recursion lost its order
+    AMBIGUOUS = 32  # periodic outputs only: several multiples of the period fit, so the entry says less, or nothing
 
 
 def bit_mask(bits: Iterable[tuple[Any, Status]]) -> Any:
@@ -49,6 +50,7 @@ class Source(enum.IntEnum):
     INPUT = 5  # bounds of the unknown input against each other, by input
     CERTIFICATE = 6  # the certified bound, by state
     BALANCE = 7  # a combination of dynamics and outputs that is free of the unknown input, by circuit of [G; H]
+    PERIODIC = 8  # no multiple of its period brings a periodic output to where the box is, by output
 
 
 SOURCE_STRIDE = 1 << 16

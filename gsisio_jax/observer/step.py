@@ -15,6 +15,7 @@ from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, choose, entire_like, nan_to_unbounded
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
+from gsisio_jax.observer import periodic
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
@@ -57,6 +58,10 @@ def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold
         The next `Carry`, and a `StepOutput`.
     """
     maps = Maps.of(observer, y.dtype)
+    if observer.system.periodic:
+        domain, fallback, d, seen = periodic.contract(_contract, maps, carry, y, u, noise, hold)
+        after, out = _finish(maps, domain, fallback, carry, d, seen.y, u, seen.noise, hold)
+        return after, periodic.noted(out, y, seen)
     domain, fallback, d = _contract(maps, carry, y, u, noise)
     if hold:
         fallback, _, _ = _contract(maps, carry, jnp.full_like(y, jnp.nan), u, noise)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.plant.periodic import wrapped_outputs
 from gsisio_jax.plant.system import Noise, System
 
 
@@ -34,7 +35,8 @@ def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = N
 
     Returns:
         `Simulation`. w and v are computed back from the recorded x and y, so that rounding of the sums cannot carry
-        the record out of the stated bounds by more than the rounding of that difference.
+        the record out of the stated bounds by more than the rounding of that difference. Periodic outputs are wrapped
+        to between minus and plus half a period; states are not.
 
     Raises:
         ValueError: shapes do not agree.
@@ -80,8 +82,9 @@ def _simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any) -
 
 
 def measured(system: System, x: Any, d: Any, u: Any, v: Any, bounds: Interval) -> tuple[Any, Any]:
-    """The measurement y[k], and the noise v[k] that it holds after rounding."""
-    return _add(system.measurement(x, u) + system.D @ u + system.H @ d, v, bounds)
+    """The measurement y[k], periodic outputs as a sensor logs them, and the noise v[k] that it holds after rounding."""
+    y, v = _add(system.measurement(x, u) + system.D @ u + system.H @ d, v, bounds)
+    return wrapped_outputs(system.periodic, y), v
 
 
 def moved(system: System, x: Any, d: Any, u: Any, w: Any, bounds: Interval) -> tuple[Any, Any]:

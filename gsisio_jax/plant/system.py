@@ -6,7 +6,7 @@ y[k]   = g(x[k], u[k]) + D u[k] + H d[k] + v[k]
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -16,6 +16,7 @@ import numpy as np
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.plant.calls import as_vector, check_map, takes_u
 from gsisio_jax.plant.captured import Captured, captured, changed
+from gsisio_jax.plant.periodic import Periods, check_feedthrough, check_states, read_periods, turns
 
 
 class System(eqx.Module):
@@ -32,13 +33,23 @@ class System(eqx.Module):
         state_bounds: box (n,) that every state is known to stay in (physics); all of R^n if not given.
         input_bounds: box (p,) that the unknown input is known to stay in; nothing is assumed if not given.
         m: number of known inputs, needed only where f or g takes ``u`` and both B and D are left out.
+        periodic: ``{index of an output: period}`` for outputs that are logged modulo a period, such as a heading in
+            (-pi, pi]: ``{2: 2 * math.pi}``, or 360 in degrees. g still returns the angle itself (``x[2]``, and not its
+            arctangent or remainder, which jump); a measured value stands for itself plus any multiple of the period,
+            and the observer finds which. The period is taken to be known to one unit in its last place.
+        periodic_states: ``{index of a state: period}`` for states that mean the same after a period: f and g must not
+            change but for multiples of the periods of periodic states and outputs (tried at some points). Their boxes
+            stay on the real line as long as the multiple is known; where it is lost (an unknown heading, an unbounded
+            d that turns it, a gap, a conflict) a box holds the state plus some multiple, see `wrapped` and `nearest`.
+            Needs `periodic` outputs (there is nothing to choose without them), and acts in the current form.
 
     Raises:
         ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
             the wrong shape, it is unclear whether f or g takes u, known inputs have no effect, or a bound does not
-            fit.
+            fit; an index or a period cannot be, an unbounded input enters a periodic output, or f or g change with a
+            periodic state.
 
-    Source: paper, (eq:system); theory 1.
+    Source: paper, (eq:system); theory 1 and 8.4.
     """
 
     f: Callable[..., Any] = eqx.field(static=True)
@@ -52,6 +63,9 @@ class System(eqx.Module):
     state_bounds: Interval
     input_bounds: Interval
     captured: tuple[Captured, Captured] = eqx.field(static=True)  # also tells apart one f before and after a change
+    periodic: Periods = eqx.field(static=True)
+    periodic_states: Periods = eqx.field(static=True)
+    turns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -64,6 +78,9 @@ class System(eqx.Module):
         state_bounds: Interval | None = None,
         input_bounds: Interval | None = None,
         m: int | None = None,
+        *,
+        periodic: Mapping[int, float] | None = None,
+        periodic_states: Mapping[int, float] | None = None,
     ):
         self.f, self.g = f, g
         self.G, self.H = _matrix("G", G), _matrix("H", H)
@@ -81,8 +98,14 @@ class System(eqx.Module):
         self.state_bounds = _bounds("state_bounds", state_bounds, self.n)
         self.input_bounds = _bounds("input_bounds", input_bounds, self.p)
         self.captured = captured(f), captured(g)
+        self.periodic = read_periods("periodic", periodic, self.l, "output")
+        self.periodic_states = read_periods("periodic_states", periodic_states, self.n, "state")
+        check_feedthrough(self.periodic, self.H, self.input_bounds)
+        check_states(self.periodic_states, self.state_bounds)
+        self.turns = ()
         check_map("f", self.dynamics, self.n, self.n, m)
         check_map("g", self.measurement, self.l, self.n, m)
+        self.turns = turns(self.maps, self.n, self.m, self.periodic, self.periodic_states, self.state_bounds)
 
     @property
     def n(self) -> int:

@@ -17,6 +17,7 @@ from gsisio_jax import scalar
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.fixed import Fixed
+from gsisio_jax.plant.periodic import nearest
 from gsisio_jax.study.axes import bare
 from gsisio_jax.study.reduction_base import Context, Kept, Reduction
 from gsisio_jax.study.row_source import Rows
@@ -84,7 +85,7 @@ def _case(
         k, given = step
         row, carried = source.following(observer, case, carried, k, given)
         carry, out = scan.advance(observer, carry, row.y, row.u, row.noise, hold)
-        context = Context(steady, row.x, row.d)
+        context = Context(steady, nearest(observer, row.x, out.state), row.d)
         after, kept = [], []
         for reduction, before in zip(reductions, states, strict=True):
             if isinstance(reduction, Kept):
@@ -117,7 +118,7 @@ def _start(
     """Step 0: the carry of the observer, that of the source, the states of the reductions, and the boxes."""
     row, carried = source.first(observer, case)
     carry, out = scan.begin(observer, case["initial"], row.y, row.u, row.noise, hold)
-    context, zero = Context(case["steady"], row.x, row.d), jnp.int32(0)
+    context, zero = Context(case["steady"], nearest(observer, row.x, out.state), row.d), jnp.int32(0)
     states = [r.row(out, zero, context) if isinstance(r, Kept) else r.init(out, context) for r in reductions]
     return carry, carried, jax.tree.map(jnp.asarray, states), out
 
@@ -198,7 +199,9 @@ def fingerprint(
     system = observer.system
     maps = jax.make_jaxpr(system.maps)(np.zeros(system.n), np.zeros(system.m))
     names = [repr(r) if is_dataclass(r) else f"{type(r).__qualname__} {r.name}" for r in reductions]
-    static = (getattr(observer, name, None) for name in ("bounds", "sweeps", "output_rows", "framer", "rounding"))
+    static = [getattr(observer, name, None) for name in ("bounds", "sweeps", "output_rows", "framer", "rounding")]
+    if system.periodic or system.periodic_states:
+        static.append((system.periodic, system.periodic_states))
     text, constants = source.identity(observer)
     digest = hashlib.sha256(repr((jax.__version__, str(maps.jaxpr), text, names, *static, *rest)).encode())
     # f and g make the structure of the observer's pytree differ between processes, but not its leaves.

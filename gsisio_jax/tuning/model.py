@@ -33,6 +33,8 @@ def with_model(observer: Observer, system: System) -> Observer:
     for name in ("G", "H", "B", "D"):
         if not np.array_equal(getattr(old, name), getattr(system, name)):
             raise ValueError(f"with_model: the models must share the matrix {name}; only f and g may change")
+    if (old.periodic, old.periodic_states) != (system.periodic, system.periodic_states):
+        raise ValueError("with_model: the models must have the same periodic outputs and states")
     if (old.f_takes_u, old.g_takes_u) != (system.f_takes_u, system.g_takes_u):
         raise ValueError("with_model: f and g must take the same arguments as those of the design")
     if "abstraction" in observer.bounds:

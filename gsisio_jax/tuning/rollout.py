@@ -12,6 +12,7 @@ import numpy as np
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.types import Observer, cast
+from gsisio_jax.plant.periodic import nearest
 from gsisio_jax.tuning.compiled import quickly
 from gsisio_jax.tuning.fold import fold_rows
 from gsisio_jax.tuning.records import Records
@@ -53,7 +54,7 @@ def score_record(observer: Observer, noise: Any, record: dict[str, Any], room: A
 
     def update(score: Score, out: Any, k: Any, truth: Any) -> Score:
         x, d = truth
-        inside = jnp.minimum(_slack(out.state, x, room), _slack(out.input, d, 0.0))
+        inside = jnp.minimum(_slack(out.state, nearest(observer, x, out.state), room), _slack(out.input, d, 0.0))
         violated, conflict = inside < 0, out.margin < 0
         slack = jnp.minimum(out.margin, inside)
         now = jnp.where(conflict, -out.margin, 0) + jnp.where(violated, -inside, 0)

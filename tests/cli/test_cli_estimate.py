@@ -206,3 +206,73 @@ def test_help_and_version_need_no_extra():
     line = "gsisio: the command line needs {}; install it with: pip install 'gsisio_jax[cli]'\n"
     assert call("estimate", "flight") == (2, "", line.format("pandas"))
     assert call("design", "flight") == (2, "", line.format("pydantic"))
+
+
+COMPASS = """\
+import gsisio_jax as gx
+
+def f(x):
+    return x + 20.0
+
+def g(x):
+    return x
+
+def plant():
+    return gx.System(f=f, g=g, G=[[1.0]], H=[[0.0]], input_bounds=gx.Interval([-5.0], [5.0]))
+"""
+
+
+def test_an_angle_that_wraps(project):
+    """A course in degrees, logged in [0, 360): named in the file, by name."""
+    (project.folder / "compass_model.py").write_text(COMPASS)
+    project.config = """\
+[system]
+use = "compass_model:plant"
+[system.periodic]
+compass = 360
+[system.periodic_states]
+course = 360
+[signals]
+state = [{name = "course", unit = "deg"}]
+output = [{name = "compass", unit = "deg"}]
+[noise]
+w = {radius = [0.1]}
+v = {radius = [2.0]}
+[region]
+lower = [-inf]
+upper = [inf]
+[initial]
+lower = [-inf]
+upper = [inf]
+[table]
+file = "cart.csv"
+time = "t"
+sample_time = 1
+y = ["compass"]
+[design]
+sweeps = 1
+[outputs]
+csv = "boxes.csv"
+"""
+    course = 350.0 + 20.0 * np.arange(60) + np.cumsum(np.random.default_rng(0).uniform(-5, 5, 60))
+    seen = np.mod(course + np.random.default_rng(1).uniform(-2, 2, 60), 360)
+    project.write_table(["t,compass", *(f"{k},{value!r}" for k, value in enumerate(map(float, seen)))])
+    code, _out, err = project.run()
+    assert (code, err) == (0, "")
+    boxes, _ = read_boxes(project.out / "boxes.csv")
+    assert (boxes["status"] == 0).all()
+    turns = 360 * np.rint((boxes["course_lower"] - course) / 360)
+    assert (boxes["course_lower"] <= course + turns).all()
+    assert (course + turns <= boxes["course_upper"]).all()
+    assert len(set(turns)) == 1
+    assert (boxes["course_upper"] - boxes["course_lower"] < 4.1).all()
+    for old, new, part in (
+        ("compass = 360", "course = 360", "system.periodic: there is no output course; they are: compass"),
+        ("compass = 360", "compass = 0", "system: System: `periodic`[0] must be a positive, finite period"),
+        ("compass = 360", 'compass = "turn"', "system.periodic.compass must be a valid number"),
+        ("[system.periodic]\ncompass = 360\n", "", "system: System: state 0 is not periodic"),
+    ):
+        before = project.config
+        project.edit(old, new)
+        project.refused("cart.toml: " + part)
+        project.config = before
