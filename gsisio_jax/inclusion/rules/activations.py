@@ -157,7 +157,7 @@ def _sinc(t: Any) -> Any:
     p = math.pi * t
     near = abs(p) < 1
     square = jnp.where(near, p, 0) ** 2
-    series = sum((-1) ** k * square**k / math.factorial(2 * k + 1) for k in range(10))
+    series = sum((-1) ** k * square**k / float(math.factorial(2 * k + 1)) for k in range(10))
     return jnp.where(near, series, jnp.sin(p) / jnp.where(near, 1, p))
 
 
@@ -166,7 +166,7 @@ def _sinc_slope(t: Any) -> Any:
     near = abs(p) < 1
     inner = jnp.where(near, p, 0)
     square = inner**2
-    series = sum((-1) ** k * 2 * k * square ** (k - 1) / math.factorial(2 * k + 1) for k in range(1, 11))
+    series = sum((-1) ** k * 2 * k * square ** (k - 1) / float(math.factorial(2 * k + 1)) for k in range(1, 11))
     return math.pi * jnp.where(near, inner * series, (jnp.cos(p) - _sinc(t)) / jnp.where(near, 1, p))
 
 
