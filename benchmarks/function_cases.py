@@ -248,7 +248,6 @@ def _plumbing() -> dict[str, Case]:
         "jvp": (lambda x: jax.jvp(jnp.sin, (x,), (jnp.ones(2),))[1], WIDE),
         "jacfwd": (jax.jacfwd(jnp.sin), WIDE),
         "optimization_barrier": (lambda x: lax.optimization_barrier(x) * 2, WIDE),
-        "stop_gradient": (lax.stop_gradient, WIDE),
     }
 
 

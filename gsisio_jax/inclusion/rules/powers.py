@@ -9,17 +9,18 @@ import numpy as np
 
 from gsisio_jax.inclusion.node import is_node, settled
 from gsisio_jax.inclusion.rules.bilinear import integer_power, raise_to
-from gsisio_jax.inclusion.rules.linear import structural
+from gsisio_jax.inclusion.rules.linear import move, structural
 from gsisio_jax.interval.box import is_concrete
 
 _MOST_EXPONENTS = 32
 
 
-def power(x: Any, p: Any) -> Any:
+def power(eqn: Any, x: Any, p: Any) -> Any:
     """``x ** p``; every exponent that occurs is a function of one variable."""
     if is_node(p) or not is_concrete(p) or not is_node(x):
         return raise_to(x, p)
-    exponents = np.broadcast_to(np.asarray(p, float), x.shape)
+    shape = eqn.outvars[0].aval.shape
+    x, exponents = move(lambda v: jnp.broadcast_to(v, shape), x), np.broadcast_to(np.asarray(p, float), shape)
     different = np.unique(exponents)
     if not 1 < len(different) <= _MOST_EXPONENTS:
         return raise_to(x, p)

@@ -201,7 +201,7 @@ ELEMENTWISE: dict[str, Rule] = {
     "mul": _mul,
     "div": _div,
     "rem": _plain(comparison.truncated_remainder),
-    "pow": _plain(powers.power),
+    "pow": powers.power,
     "integer_pow": lambda eqn, x: bilinear.integer_power(x, eqn.params["y"]),
     "atan2": _plain(bilinear.angle),
     "max": _plain(comparison.maximum),
