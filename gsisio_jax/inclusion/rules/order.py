@@ -112,7 +112,8 @@ def _as_numbers(x: Node) -> Node:
     if x.dtype != bool:
         return x
     kind = jnp.result_type(float)
-    return Node(Interval.unchecked(*(jnp.asarray(side).astype(kind) for side in (x.range.lower, x.range.upper))), None, x.jac)
+    lower, upper = (jnp.asarray(side).astype(kind) for side in (x.range.lower, x.range.upper))
+    return Node(Interval.unchecked(lower, upper), None, x.jac)
 
 
 def _place(eqn: Any, x: Node) -> Node:

@@ -67,7 +67,7 @@ def _squares(graph: Makers, atom: Any) -> list[tuple[Any, tuple[int, ...], bool]
     name, inner = eqn.primitive.name, eqn.invars[0]
     if name == "square" or (name == "integer_pow" and eqn.params["y"] == 2):
         return [(inner, (), False)]
-    if name == "mul" and graph.same(*eqn.invars):
+    if name == "mul" and not isinstance(inner, jex.Literal) and graph.same(*eqn.invars):
         return [(inner, (), False)]
     if name == "dot_general" and graph.same(*eqn.invars) and inner.aval.ndim == 1:
         return [(inner, (0,), False)]
