@@ -41,7 +41,7 @@ def _unshifted(graph: Makers, h: Any, axes: tuple[int, ...]) -> tuple[Any, Any]:
     return (a, common) if common is not None else (h, None)
 
 
-def _over(rule: Callable[[Node], Node], axes: tuple[int, ...], eqn: Any, keeps: bool) -> Callable[..., Node]:
+def _over(rule: Callable[[Node], Node], axes: tuple[int, ...], eqn: Any, keeps: bool) -> Callable[..., Node | None]:
     (axis,), shape = axes, eqn.outvars[0].aval.shape
 
     def run(a: Any) -> Node | None:
@@ -50,7 +50,7 @@ def _over(rule: Callable[[Node], Node], axes: tuple[int, ...], eqn: Any, keeps: 
         found = rule(move(lambda v: jnp.moveaxis(v, axis, 0), a))
         return move(lambda v: (jnp.moveaxis(v, 0, axis) if keeps else v).reshape(shape), found)
 
-    return run  # type: ignore[return-value]
+    return run
 
 
 def softmax(graph: Makers, eqn: Any) -> Match | None:

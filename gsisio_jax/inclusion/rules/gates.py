@@ -98,8 +98,9 @@ def _value(graph: Makers, eqn: Any, leaf: Any, t: float) -> Any:
     """The expression at one number."""
     args = []
     for atom in eqn.invars:
+        aval: Any = atom.aval
         if isinstance(atom, jex.Literal):
-            args.append(jnp.asarray(atom.val, atom.aval.dtype))
+            args.append(jnp.asarray(atom.val, aval.dtype))
         elif atom is leaf:
             args.append(jnp.full(leaf.aval.shape, t, leaf.aval.dtype))
         else:

@@ -20,7 +20,7 @@ MOST_TERMS = 64  # of a sum that is known as a whole
 class Match:
     """An equation that stands for a known function of other variables."""
 
-    rule: Callable[..., Node]
+    rule: Callable[..., Node | None]
     operands: Sequence[Any]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from gsisio_jax.inclusion.form_arithmetic import shift, slope_image
-from gsisio_jax.inclusion.node import Form, Node, best_form, parts, settled, slack_of, slope_of
+from gsisio_jax.inclusion.node import Node, best_form, parts, settled, slack_of, slope_of
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like
 
@@ -71,6 +71,5 @@ def with_form(natural: Interval, like: Node | None, jac: Interval | None) -> Nod
     if like is None or like.form is None:
         return Node(natural, None, jac)
     like = settled(like)
-    form = like.form
-    assert isinstance(form, Form)
+    form: Any = like.form
     return Node(natural, best_form(form.slope, form.offset, natural, form.box, form.slack), jac)

@@ -216,7 +216,7 @@ def determinant(a: Node) -> Node:
     """Of a node (n, n), over the minors of its first k rows: n products of arrays."""
     n = a.shape[0]
     minors = move(lambda v: v[0], a)  # of row 0 and column j
-    before = [(j,) for j in range(n)]
+    before: list[tuple[int, ...]] = [(j,) for j in range(n)]
     for k in range(1, n):
         sets = list(itertools.combinations(range(n), k + 1))
         columns = np.array(sets)

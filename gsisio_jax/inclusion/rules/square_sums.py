@@ -48,7 +48,7 @@ def norm(graph: Makers, eqn: Any) -> Match | None:
 
 
 def _nonnegative(value: Any) -> bool:
-    return isinstance(value, np.ndarray | np.generic) and bool((np.asarray(value) >= 0).all())
+    return isinstance(value, np.ndarray | np.generic) and not np.signbit(np.asarray(value, float)).any()
 
 
 def _shape(value: Any) -> tuple[int, ...]:
@@ -65,17 +65,18 @@ def _squares(graph: Makers, atom: Any) -> list[tuple[Any, tuple[int, ...], bool]
     if eqn is None:
         return None
     name, inner = eqn.primitive.name, eqn.invars[0]
+    aval: Any = inner.aval
     if name == "square" or (name == "integer_pow" and eqn.params["y"] == 2):
         return [(inner, (), False)]
     if name == "mul" and not isinstance(inner, jex.Literal) and graph.same(*eqn.invars):
         return [(inner, (), False)]
-    if name == "dot_general" and graph.same(*eqn.invars) and inner.aval.ndim == 1:
+    if name == "dot_general" and graph.same(*eqn.invars) and aval.ndim == 1:
         return [(inner, (0,), False)]
     if name == "reduce_sum":
         below = _squares(graph, inner)
         if below is None or any(axes or constant for _, axes, constant in below):
             return None
-        if any(leaf.aval.shape != inner.aval.shape for leaf, _, _ in below):
+        if any(leaf.aval.shape != aval.shape for leaf, _, _ in below):
             return None
         return [(leaf, tuple(eqn.params["axes"]), False) for leaf, _, _ in below]
     if name in ("add", "add_any"):
