@@ -76,7 +76,9 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
 
 def _recognised(match: Any, read: Callable[[Any], Any]) -> Any:
     """The value of an equation that ends a known expression."""
-    operands = [read(atom) for atom in match.operands] if match is not None else []
+    if match is None:
+        return None
+    operands = [read(atom) for atom in match.operands]
     value = match.rule(*map(settled, operands)) if any(map(is_node, operands)) else None
     return None if value is None else settle(value)
 

@@ -70,6 +70,5 @@ def with_form(natural: Interval, like: Node | None, jac: Interval | None) -> Nod
     """A node with that range, the form of another node where it says more, and that Jacobian."""
     if like is None or like.form is None:
         return Node(natural, None, jac)
-    like = settled(like)
-    form: Any = like.form
+    form: Any = settled(like).form
     return Node(natural, best_form(form.slope, form.offset, natural, form.box, form.slack), jac)
