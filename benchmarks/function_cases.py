@@ -239,18 +239,8 @@ def _arrays() -> dict[str, Case]:
 
 
 def _plumbing() -> dict[str, Case]:
-    def printed(x: Any) -> Any:
-        jax.debug.print("{}", x)
-        return x + 1
-
-    def called(x: Any) -> Any:
-        jax.debug.callback(lambda v: None, x)
-        return x + 1
-
     return {
         "device_put": (lambda x: jax.device_put(x) * 2, WIDE),
-        "debug.print": (printed, WIDE),
-        "debug.callback": (called, WIDE),
         "checkpoint": (jax.checkpoint(jnp.sin), WIDE),
         "named_call": (jax.named_call(jnp.sin, name="call"), WIDE),
         "jit": (jax.jit(jnp.sin), WIDE),
@@ -258,7 +248,6 @@ def _plumbing() -> dict[str, Case]:
         "jvp": (lambda x: jax.jvp(jnp.sin, (x,), (jnp.ones(2),))[1], WIDE),
         "jacfwd": (jax.jacfwd(jnp.sin), WIDE),
         "optimization_barrier": (lambda x: lax.optimization_barrier(x) * 2, WIDE),
-        "stop_gradient": (lax.stop_gradient, WIDE),
     }
 
 

@@ -170,6 +170,8 @@ class Node(eqx.Module):
         if self.given is None:
             assert self.form is not None
             image = guard(self.form.image())
+            if image.lower.dtype != self.dtype:  # of a box whose numbers were promoted
+                image = Interval.unchecked(*(side.astype(self.dtype) for side in (image.lower, image.upper)))
             object.__setattr__(self, "given", image if is_known(image.lower) else computed_once(image))
         assert self.given is not None
         return self.given

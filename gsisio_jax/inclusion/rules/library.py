@@ -21,8 +21,10 @@ from jax.core import Tracer
 from gsisio_jax.inclusion.form_arithmetic import known_if_concrete
 from gsisio_jax.inclusion.node import Node, as_node, is_node, normalised
 from gsisio_jax.inclusion.rules import activations, solving, vectors
+from gsisio_jax.inclusion.rules.comparison import select, step
 from gsisio_jax.inclusion.rules.functions import CURVES
-from gsisio_jax.inclusion.rules.linear import move
+from gsisio_jax.inclusion.rules.gates import GATES
+from gsisio_jax.inclusion.rules.linear import add, move, multiple, negative
 from gsisio_jax.inclusion.rules.order import count_below
 from gsisio_jax.inclusion.rules.tables import PiecewiseLinear, interpolation
 from gsisio_jax.inclusion.rules.univariate import apply
@@ -114,6 +116,18 @@ def _hypot(eqn: Any, x: Any, y: Any) -> list[Any]:
     return [vectors.hypot(whole(x), whole(y))]
 
 
+def _copysign(eqn: Any, x: Any, y: Any) -> list[Any] | None:
+    """The magnitude of x with the sign of y; that of a zero may be either."""
+    if not is_node(y):
+        return None
+    aval = eqn.outvars[0].aval
+    x, y = (v if is_node(v) else as_node(v, np.shape(v), aval.dtype) for v in (x, y))
+    x, y = (move(lambda w: jnp.broadcast_to(w, aval.shape).astype(aval.dtype), v) for v in (x, y))
+    size = normalised(apply(CURVES["abs"], x))
+    below = step(Interval.unchecked(y.range.upper < 0, y.range.lower <= 0), [y])
+    return [select(below, size, negative(size))]
+
+
 def _square(a: Any) -> int | None:
     """Rows of one square matrix, None for a batch of them."""
     shape = a.shape if is_node(a) else np.shape(a)
@@ -154,12 +168,10 @@ def _one_of(*pairs: tuple[Any, Callable[[np.ndarray], Any]]) -> Rule:
     return rule
 
 
-def _erf(t: np.ndarray) -> np.ndarray:
-    return np.vectorize(math.erf)(t) if t.size else t
-
-
-def _gelu_tanh(t: np.ndarray) -> np.ndarray:
-    return 0.5 * t * (1 + np.tanh(math.sqrt(2 / math.pi) * (t + 0.044715 * t**3)))
+def _logit(eqn: Any, x: Node) -> list[Any]:
+    """``log(x / (1 - x))`` as ``2 atanh(2 x - 1)``, with one x."""
+    moved = add(multiple(2.0, x), -np.ones(x.shape, x.dtype))
+    return [multiple(2.0, apply(CURVES["atanh"], normalised(moved)))]
 
 
 WHOLE: dict[str, Rule] = {
@@ -167,14 +179,12 @@ WHOLE: dict[str, Rule] = {
     "searchsorted": _searchsorted,
     "norm": _norm,
     "hypot": _hypot,
+    "copysign": _copysign,
     "det": _det,
     "slogdet": _slogdet,
-    "silu": _one_of((activations.SILU, lambda t: t / (1 + np.exp(-t)))),
-    "gelu": _one_of(
-        (activations.GELU_TANH, _gelu_tanh),
-        (activations.GELU, lambda t: 0.5 * t * (1 + _erf(t / math.sqrt(2)))),
-    ),
-    "mish": _one_of((activations.MISH, lambda t: t * np.tanh(np.log1p(np.exp(t))))),
+    "logit": _logit,
+    "silu": _one_of(GATES["silu"]),
+    "mish": _one_of(GATES["mish"]),
     "soft_sign": _one_of((activations.SOFT_SIGN, lambda t: t / (1 + np.abs(t)))),
     "sinc": _one_of((activations.SINC, np.sinc)),
 }

@@ -33,7 +33,6 @@ from gsisio_jax.inclusion.node import (
     as_node,
     chain,
     is_node,
-    jac_of,
     join,
     meet,
     normalised,
@@ -103,13 +102,21 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
     ranges = ranges or [None] * len(forms)
     jacs: list[Any] = [None] * len(forms)
     if jac is not None:
-        parts_of = [jac_of(v, jac.lower.shape[0]) for v in nodes]
+        parts_of = [_jac_like(v, jac) for v in nodes]
         jacs = both(parts_of, along)
         if adds:
             entering = run(along, *(((v.lower != 0) | (v.upper != 0)).astype(dtype) for v in parts_of))
             jacs = [sparse(found, Interval.unchecked(entering, entering)) for found in jacs]
     unnormalised = rounding.outward() and (adds or any(v.unnormalised for v in nodes))
     return [Node(*triple, unnormalised) for triple in zip(ranges, forms, jacs, strict=True)]
+
+
+def _jac_like(node: Node, jac: Interval) -> Interval:
+    """The Jacobian of a node in the type of another one; truth values and whole numbers have none of their own."""
+    if node.jac is not None:
+        return node.jac
+    zero = np.zeros((jac.lower.shape[0], *node.shape), jac.lower.dtype)
+    return Interval.unchecked(zero, zero)
 
 
 def is_zeros(values: Sequence[Any]) -> bool:

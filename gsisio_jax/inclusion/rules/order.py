@@ -16,7 +16,7 @@ import numpy as np
 
 from gsisio_jax.inclusion.node import Node, as_node, is_node, meet, normalised
 from gsisio_jax.inclusion.rules.comparison import at_most, less, step
-from gsisio_jax.inclusion.rules.linear import move, structural
+from gsisio_jax.inclusion.rules.linear import move, negative, structural
 from gsisio_jax.inclusion.rules.possible import hull_of_rows
 from gsisio_jax.interval.box import Interval
 
@@ -99,19 +99,31 @@ def top_k(eqn: Any, x: Node) -> list[Any]:
 
 def argmax(eqn: Any, x: Node) -> Node:
     """The place of the largest entry; the first one of several."""
-    return _place(eqn, x, lambda first, second: less(first, second).range.lower)
+    return _place(eqn, _as_numbers(x))
 
 
 def argmin(eqn: Any, x: Node) -> Node:
-    return _place(eqn, x, lambda first, second: less(second, first).range.lower)
+    return _place(eqn, negative(_as_numbers(x)))
 
 
-def _place(eqn: Any, x: Node, beaten: Any) -> Node:
-    (axis,) = eqn.params["axes"]
+def _as_numbers(x: Node) -> Node:
+    """Truth values as 0 and 1."""
     x = normalised(x)
+    if x.dtype != bool:
+        return x
+    kind = jnp.result_type(float)
+    lower, upper = (jnp.asarray(side).astype(kind) for side in (x.range.lower, x.range.upper))
+    return Node(Interval.unchecked(lower, upper), None, x.jac)
+
+
+def _place(eqn: Any, x: Node) -> Node:
+    (axis,) = eqn.params["axes"]
     rows = _front(x, axis)
     n = rows.shape[0]
-    possible = ~beaten(*_against(Node(rows.range, rows.form))).any(1)
+    first, second = _against(Node(rows.range, rows.form))
+    earlier = np.tri(n, k=-1, dtype=bool).reshape(n, n, *(1,) * (len(rows.shape) - 1))  # j before i
+    beaten = less(first, second).range.lower | (at_most(first, second).range.lower & earlier)
+    possible = ~beaten.any(1)
     k = np.arange(n).reshape(n, *(1,) * (len(rows.shape) - 1))
     lower, upper = jnp.where(possible, k, n).min(0), jnp.where(possible, k, -1).max(0)
     return step(Interval.unchecked(lower.astype(x.dtype), upper.astype(x.dtype)), [x])

@@ -66,9 +66,9 @@ def formless(node: Node) -> Node:
     return Node(node.given, node.form, None, node.unnormalised)
 
 
-def with_form(natural: Interval, like: Any, jac: Interval | None) -> Node:
+def with_form(natural: Interval, like: Node | None, jac: Interval | None) -> Node:
     """A node with that range, the form of another node where it says more, and that Jacobian."""
     if like is None or like.form is None:
         return Node(natural, None, jac)
-    form = normalised(like).form
+    form: Any = normalised(like).form
     return Node(natural, best_form(form.slope, form.offset, natural, form.box, form.slack), jac)

@@ -27,6 +27,8 @@ from gsisio_jax.inclusion.rules import (
     library,
     linear,
     order,
+    powers,
+    scattering,
     solving,
     univariate,
 )
@@ -177,6 +179,16 @@ def _scattered(eqn: Any) -> int:
     return 1 + math.prod(eqn.invars[2].aval.shape)
 
 
+def _scatter(known: Rule, other: Rule) -> Rule:
+    """By the places that are met, where these are known."""
+
+    def rule(eqn: Any, *args: Any) -> Any:
+        found = known(eqn, *args)
+        return other(eqn, *args) if found is None else found
+
+    return rule
+
+
 def _truth_reduce(fn: Callable[..., Any]) -> Rule:
     def rule(eqn: Any, x: Node) -> Node:
         axes = tuple(eqn.params["axes"])
@@ -195,7 +207,7 @@ ELEMENTWISE: dict[str, Rule] = {
     "mul": _mul,
     "div": _div,
     "rem": _plain(comparison.truncated_remainder),
-    "pow": _plain(bilinear.raise_to),
+    "pow": powers.power,
     "integer_pow": lambda eqn, x: bilinear.integer_power(x, eqn.params["y"]),
     "atan2": _plain(bilinear.angle),
     "max": _plain(comparison.maximum),
@@ -231,8 +243,13 @@ REDUCTIONS: dict[str, Rule] = {
     "cumprod": _running(bilinear.multiply),
     "cummax": _running(comparison.maximum),
     "cummin": _running(comparison.minimum),
-    "scatter-add": _structural(0, 2, terms=_scattered),
-    "scatter_add": _structural(0, 2, terms=_scattered),
+    **dict.fromkeys(
+        ("scatter-add", "scatter_add"), _scatter(scattering.scatter_add, _structural(0, 2, terms=_scattered))
+    ),
+    "scatter-sub": scattering.scatter_sub,
+    **dict.fromkeys(("scatter-mul", "scatter_mul"), scattering.combined(bilinear.multiply, 1.0)),
+    **dict.fromkeys(("scatter-max", "scatter_max"), scattering.combined(comparison.maximum, -math.inf)),
+    **dict.fromkeys(("scatter-min", "scatter_min"), scattering.combined(comparison.minimum, math.inf)),
     "cumsum": _structural(terms=lambda eqn: eqn.invars[0].aval.shape[eqn.params["axis"]]),
     "conv_general_dilated": convolution.convolve,
 }
@@ -262,13 +279,13 @@ MOVES: dict[str, Rule] = {
         "stack": (),
         "split": (0,),
         "slice": (0,),
-        "scatter": (0, 2),
         "pad": (0, 1),
         "device_put": (),
         "unstack": (0,),
     }.items()
 }
 MOVES |= {
+    "scatter": _scatter(scattering.scatter, _structural(0, 2)),
     "gather": _structural(0, moving=indexing.gather),
     "dynamic_slice": _structural(0, moving=indexing.dynamic_slice),
     "dynamic_update_slice": _structural(0, 1, moving=indexing.dynamic_update_slice),
@@ -277,6 +294,8 @@ MOVES |= {
     "argmax": order.argmax,
     "argmin": order.argmin,
     "lu": lambda eqn, a: solving.lu(a),
+    # Of pivots that say "none" or nothing at all, which are the ones that `solving.lu` makes.
+    "lu_pivots_to_permutation": lambda eqn, pivots: Node(pivots.range, None, pivots.jac),
     "cholesky": lambda eqn, a: solving.cholesky(a),
     "triangular_solve": solving.triangular_solve,
     "custom_linear_solve": library.linear_system,
@@ -293,4 +312,6 @@ LIBRARY: dict[str, Rule] = {
     "remainder": _plain(comparison.floored_remainder),
     "floor_divide": lambda eqn, x, y: comparison.staircase(jnp.floor, -1.0, 0.0)(bilinear.divide(x, y)),
     "trunc": _plain(comparison.truncate),
+    "fmax": _plain(comparison.maximum),
+    "fmin": _plain(comparison.minimum),
 }

@@ -11,8 +11,10 @@ floating numbers around each. A value at a, ``v_i + m_i (a - t_i)``, is off by `
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial, wraps
 from typing import Any
 
 import jax
@@ -23,6 +25,20 @@ import numpy as np
 from gsisio_jax.inclusion.rules.univariate import extremes
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose
+
+
+def _whole(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of arrays a and b that programs of single numbers (`gsisio_jax.scalar`) keep as an operation on arrays:
+    they would write out every knot."""
+
+    @wraps(fn)
+    def run(self: Any, a: Any, b: Any) -> Any:
+        plain = partial(fn, self)
+        kept = jax.custom_jvp(plain)
+        kept.defjvp(lambda primals, tangents: jax.jvp(plain, primals, tangents))
+        return kept(a, b)
+
+    return run
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +132,7 @@ class PiecewiseLinear:
         upper = jnp.maximum(bounds.upper, jnp.where(inside, high, -jnp.inf).max(-1))
         return Interval.unchecked(lower, upper)
 
+    @_whole
     def range(self, a: Any, b: Any) -> Interval:
         found = self._extremes(a, b, None)
         # Without tails that grow no value lies beyond those of the table.
@@ -128,6 +145,7 @@ class PiecewiseLinear:
                 )
         return found
 
+    @_whole
     def derivative(self, a: Any, b: Any) -> Interval:
         left = np.append(-np.inf, self.knots)
         right = np.append(self.knots, np.inf)
@@ -145,6 +163,11 @@ class PiecewiseLinear:
         return Interval.unchecked(lower, upper)
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
+        s, rest, usable = self._line(a, b)
+        return s, choose(usable, rest, natural)
+
+    @_whole
+    def _line(self, a: Any, b: Any) -> tuple[Any, Interval, Any]:
         """The slope is that of the secant; next to an infinite end that of its tail, with which the rest is bounded."""
         low, high = jnp.isfinite(a), jnp.isfinite(b)
         both = low & high
@@ -164,7 +187,7 @@ class PiecewiseLinear:
             # The tail's slope is that of a segment, to within its rounding: times infinity, that is no bound.
             exact = self.low[-k] == self.high[-k] == self.tails[k]
             usable &= end | exact
-        return jnp.where(usable, s, 0), choose(usable, rest, natural)
+        return jnp.where(usable, s, 0), rest, usable
 
 
 def _near(slope: Fraction, side: int, dtype: Any) -> Any:

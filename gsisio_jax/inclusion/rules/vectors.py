@@ -67,13 +67,22 @@ def composed(a: Node, natural: Interval, derivative: Interval, at_center: Interv
 
 
 # Euclidean norm -------------------------------------------------------------------------------------------------------
+def _unit(large: Any) -> Any:
+    """A power of two that brings a number >= 0 into the middle of the exponents: XLA divides by multiplying with the
+    reciprocal, and that of a huge number is flushed to zero."""
+    half = 256 if large.dtype == jnp.float64 else 32
+    up, down = 2.0 ** (2 * half), 2.0 ** (-2 * half)
+    return jax.lax.stop_gradient(jnp.where(large > 2.0**half, down, jnp.where(large < 2.0**-half, up, 1.0)))
+
+
 def _length(x: Any) -> Any:
     """Over the first axis, for numbers >= 0: scaled, so that nothing overflows or vanishes."""
     large = jax.lax.stop_gradient(x.max(0))
     usual = (large > 0) & (large < jnp.inf)
-    scale = jnp.where(usual, large, 1)
-    share = jnp.where(usual, x, 1) / scale
-    return jnp.where(usual, scale * jnp.sqrt((share * share).sum(0)), large)
+    unit = _unit(large)
+    scale = jnp.where(usual, large, 1) * unit
+    share = jnp.where(usual, x, 1) * unit / scale
+    return jnp.where(usual, scale * jnp.sqrt((share * share).sum(0)) * (1 / unit), large)
 
 
 def norm(a: Node) -> Node:
@@ -106,7 +115,8 @@ def _share(x: Any, rest: Any, ulps: float, side: float) -> Any:
     it at all."""
     size = _length(jnp.stack([abs(x), rest]))
     usual = (size > 0) & (size < jnp.inf)
-    value = jnp.where(usual, x, 0) / jnp.where(usual, size, 1)
+    unit = _unit(jnp.where(usual, size, 1))
+    value = jnp.where(usual, x, 0) * unit / (jnp.where(usual, size, 1) * unit)
     value = jnp.where(size == jnp.inf, jnp.where(jnp.isfinite(x), jnp.where(x * side > 0, side, 0), jnp.sign(x)), value)
     value = rounding.up(value, ulps + 8) if side > 0 else rounding.down(value, ulps + 8)
     return jnp.clip(value, -1, 1)

@@ -1,0 +1,170 @@
+"""Functions that are known as a whole: tables, norms, softmax, activations; against NumPy and SciPy."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.special
+from sampled import SETTINGS, bounds, check
+
+from gsisio_jax import Interval, inclusion
+
+USUAL, WIDE, THREE = ([0.1, 0.1], [0.9, 0.9]), ([-1.0, -1.0], [1.0, 1.0]), ([0.1, -0.5, 0.3], [0.9, 0.4, 0.8])
+EVERY = pytest.mark.parametrize(("rounding", "dtype"), SETTINGS, ids=["float64", "float32", "nearest"])
+KNOTS = np.linspace(0.0, 1.0, 50)
+TABLE = np.sin(5 * KNOTS) + 0.1 * np.cos(40 * KNOTS)
+FEW, VALUES = np.array([0.0, 0.25, 0.5, 1.0]), np.array([0.0, 1.0, 0.5, 2.0])
+
+
+def _sigmoid(t):
+    return 1 / (1 + np.exp(-t))
+
+
+def _gelu_tanh(t):
+    return 0.5 * t * (1 + np.tanh(np.sqrt(2 / np.pi) * (t + 0.044715 * t**3)))
+
+
+CASES = {
+    # name: function, oracle, box, how wide the range may be, and the Jacobian
+    "table": (lambda x: jnp.interp(x, KNOTS, TABLE), lambda x: np.interp(x, KNOTS, TABLE),
+              ([0.42], [0.97]), 1.02, 1.01),
+    "ends of a table": (lambda x: jnp.interp(x, FEW, VALUES), lambda x: np.interp(x, FEW, VALUES),
+                        ([-0.5, 0.35], [1.5, 0.55]), 1.02, 1.01),
+    "table that jumps": (lambda x: jnp.interp(x, FEW, VALUES, left=-1.0, right=3.0),
+                         lambda x: np.interp(x, FEW, VALUES, left=-1.0, right=3.0), ([-0.5], [1.5]), 1.02, None),
+    "table of a function": (lambda x: jnp.interp(jnp.sin(x[0]) + x[1], FEW, VALUES) * x[1],
+                            lambda x: np.interp(np.sin(x[0]) + x[1], FEW, VALUES) * x[1], USUAL, 1.3, 3.0),
+    "norm at 0": (jnp.linalg.norm, np.linalg.norm, WIDE, 1.01, 1.3),
+    "norm": (jnp.linalg.norm, np.linalg.norm, THREE, 1.01, 1.1),
+    "norms of rows": (lambda x: jnp.linalg.norm(jnp.stack([x, 1 + x[::-1]]), axis=1),
+                      lambda x: np.linalg.norm(np.stack([x, 1 + x[::-1]]), axis=1), USUAL, 1.01, 1.1),
+    "hypot": (lambda x: jnp.hypot(x[0], x[1]), lambda x: np.hypot(x[0], x[1]), WIDE, 1.01, 1.3),
+    "root of squares": (lambda x: jnp.sqrt(x[0] ** 2 + x[1] * x[1] + 0.01),
+                        lambda x: np.sqrt(x[0] ** 2 + x[1] ** 2 + 0.01), WIDE, 1.01, 1.3),
+    "softmax": (jax.nn.softmax, scipy.special.softmax, THREE, 1.01, 2.5),
+    "softmax by hand": (lambda x: jnp.exp(8 * x) / jnp.exp(8 * x).sum(), lambda x: scipy.special.softmax(8 * x),
+                        WIDE, 1.01, 2.0),
+    "logsumexp": (jax.nn.logsumexp, scipy.special.logsumexp, THREE, 1.01, 1.01),
+    "log_softmax": (jax.nn.log_softmax, scipy.special.log_softmax, WIDE, 1.01, 1.01),
+    "silu": (jax.nn.silu, lambda x: x * _sigmoid(x), ([-4.0, -1.0], [3.0, 0.5]), 1.01, 1.05),
+    "silu by hand": (lambda x: x * jax.nn.sigmoid(x), lambda x: x * _sigmoid(x), WIDE, 1.01, 1.05),
+    "gelu": (jax.nn.gelu, _gelu_tanh, ([-4.0, -1.0], [3.0, 0.5]), 1.01, 1.05),
+    "gelu, exact": (lambda x: jax.nn.gelu(x, approximate=False), lambda x: x * scipy.special.ndtr(x),
+                    ([-4.0, -1.0], [3.0, 0.5]), 1.01, 1.05),
+    "mish": (jax.nn.mish, lambda x: x * np.tanh(np.log1p(np.exp(x))), ([-4.0, -1.0], [3.0, 0.5]), 1.01, 1.05),
+    "soft_sign": (jax.nn.soft_sign, lambda x: x / (1 + abs(x)), WIDE, 1.01, 1.05),
+    "sinc": (jnp.sinc, np.sinc, ([-0.4, 0.7], [2.7, 9.3]), 1.05, 1.2),
+    "logit": (jax.scipy.special.logit, scipy.special.logit, USUAL, 1.01, 1.05),
+    "erfc": (jax.scipy.special.erfc, scipy.special.erfc, WIDE, 1.01, 1.05),
+    "copysign": (lambda x: jnp.copysign(x[0], x[1]), lambda x: np.copysign(x[0], x[1]), WIDE, 1.01, None),
+    "fmax": (lambda x: jnp.fmax(x[0], x[1]), lambda x: np.fmax(x[0], x[1]), WIDE, 1.01, 1.01),
+    "powers": (lambda x: jnp.vander(x, 4), lambda x: np.vander(x, 4), WIDE, 1.01, 1.01),
+    "angle, wrapped": (lambda x: jnp.arctan2(jnp.sin(x), jnp.cos(x)), lambda x: (x + np.pi) % (2 * np.pi) - np.pi,
+                       ([2.0, 6.0], [3.0, 7.0]), 1.01, 1.01),
+    "angle across the cut": (lambda x: jnp.arctan2(jnp.sin(x), jnp.cos(x)), lambda x: np.arctan2(np.sin(x), np.cos(x)),
+                             ([3.0], [3.4]), 1.4, None),
+}  # fmt: skip
+
+
+@EVERY
+@pytest.mark.parametrize("name", CASES)
+def test_values_slopes_and_derivatives(name, rounding, dtype):
+    fn, oracle, (lower, upper), loose, slopes = CASES[name]
+    check(fn, oracle, lower, upper, rounding, dtype, loose, slopes)
+
+
+def _pair(box):
+    return np.ravel(box.lower).tolist() + np.ravel(box.upper).tolist()
+
+
+def test_ranges_that_are_known():
+    box = Interval(*WIDE)
+    assert _pair(inclusion.natural(jnp.linalg.norm, "nearest")(box)) == [0, np.sqrt(2)]
+    assert _pair(inclusion.jacobian(jnp.linalg.norm, "nearest")(box)) == [-1, -1, 1, 1]
+    assert _pair(inclusion.natural(lambda x: jnp.interp(x, FEW, VALUES), "nearest")(Interval([0.2], [0.6]))) == [
+        0.5,
+        1.0,
+    ]
+    # Slopes of the segments that the box meets, not of those that it only touches.
+    assert _pair(inclusion.jacobian(lambda x: jnp.interp(x, FEW, VALUES))(Interval([0.25], [0.5]))) == [-2, -2]
+    assert _pair(inclusion.jacobian(lambda x: jnp.interp(x, FEW, VALUES))(Interval([0.2], [0.6]))) == [-2, 4]
+    found = inclusion.natural(jax.nn.softmax)(Interval.entire(2))
+    assert _pair(found) == [0, 0, 1, 1]
+
+
+def test_tables_beyond_their_ends():
+    """Extrapolated tables keep a bounded rest on half-lines; constant ones are bounded anywhere."""
+
+    def f(x):
+        return jnp.interp(x, FEW, VALUES, left="extrapolate", right="extrapolate")
+
+    form = inclusion.affine(f, "nearest")(Interval([0.75], [np.inf]))
+    assert form.slope == 3
+    assert _pair(form.offset) == [-1, -1]
+    assert _pair(inclusion.natural(f, "nearest")(Interval([-np.inf], [0.125]))) == [-np.inf, 0.5]
+    assert _pair(inclusion.natural(lambda x: jnp.interp(x, FEW, VALUES))(Interval.entire(1))) == [0, 2]
+
+
+def test_a_table_with_a_period_or_a_jump_is_walked_as_any_other_function():
+    found = inclusion.natural(lambda x: jnp.interp(x, FEW, VALUES, period=1.0))(Interval([1.1], [1.2]))
+    oracle = np.interp(np.linspace(1.1, 1.2, 100), FEW, VALUES, period=1.0)
+    assert found.lower[0] <= oracle.min()
+    assert oracle.max() <= found.upper[0]
+    steps, heights = np.array([0.0, 0.5, 0.5, 1.0]), np.array([0.0, 0.0, 1.0, 1.0])
+    found = inclusion.natural(lambda x: jnp.interp(x, steps, heights))(Interval([0.25], [0.75]))
+    assert found.lower[0] <= 0
+    assert found.upper[0] >= 1
+    jac = inclusion.jacobian(lambda x: jnp.interp(x, steps, heights))(Interval([0.25], [0.75]))
+    assert np.isinf(jac.upper).all()
+
+
+def test_a_table_at_a_known_input():
+    """An input that is not known while tracing is looked up; its rounding is bounded as well."""
+
+    def bounds_of(x, u):
+        return inclusion.natural(lambda x, u: x + jnp.interp(u, KNOTS, TABLE), "outward")(x, u)
+
+    found = jax.jit(bounds_of)(Interval([0.0], [0.0]), 0.437)
+    exact = np.interp(0.437, KNOTS, TABLE)
+    assert found.lower[0] < exact < found.upper[0]
+    assert found.upper[0] - found.lower[0] < 1e-14
+    box = inclusion.natural(lambda x, u: x + jnp.interp(u, KNOTS, TABLE))(Interval([0.0], [0.0]), Interval(0.0, 1.0))
+    assert abs(box.upper[0] - TABLE.max()) < 1e-15
+
+
+@pytest.mark.parametrize("fn", [jnp.linalg.norm, jax.nn.softmax, jax.nn.logsumexp, jax.nn.gelu, jnp.sinc])
+def test_points_and_infinite_boxes(fn):
+    x = np.array([0.3, -0.7])
+    exact = np.asarray(fn(x))
+    at = bounds(fn, x, x, "outward", np.float64)
+    assert (at["natural"].lower <= exact).all()
+    assert (exact <= at["natural"].upper).all()
+    assert (at["natural"].upper - at["natural"].lower < 1e-12).all()
+    far = bounds(fn, [-np.inf, -1.0], [np.inf, 1.0], "outward", np.float64)
+    for key in ("natural", "affine", "offset", "jacobian"):
+        assert not np.isnan(far[key].lower).any()
+        assert not np.isnan(far[key].upper).any(), key
+        assert (far[key].lower <= far[key].upper).all()
+    assert np.isfinite(far["slope"]).all()
+
+
+def test_what_is_written_like_a_softmax_but_is_none():
+    """Exponentials of one thing over the sum of another, and a sum over another axis."""
+    other = lambda x: jnp.exp(x) / jnp.exp(2 * x).sum()  # noqa: E731
+    check(other, lambda x: np.exp(x) / np.exp(2 * x).sum(), *USUAL, "outward", np.float64, 10.0, 100.0)
+
+    def rows(x):
+        m = jnp.outer(x, jnp.array([1.0, 2.0]))
+        return jnp.exp(m) / jnp.exp(m).sum(0, keepdims=True)
+
+    def oracle(x):
+        return scipy.special.softmax(np.outer(x, [1.0, 2.0]), 0)
+
+    check(rows, oracle, *USUAL, "outward", np.float64, 1.01, 3.0)
+    shifted = lambda x: jnp.exp(x - x[0]) / jnp.exp(x - x[0]).sum()  # noqa: E731
+    check(shifted, scipy.special.softmax, *USUAL, "outward", np.float64, 1.01, 2.0)
+    # m is not common to all entries: no softmax of x.
+    uneven = lambda x: jnp.exp(x - x**2) / jnp.exp(x - x**2).sum()  # noqa: E731
+    check(uneven, lambda x: scipy.special.softmax(x - x**2), *USUAL, "outward", np.float64, 3.0, 20.0)
