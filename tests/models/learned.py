@@ -14,7 +14,7 @@ INF = np.inf
 
 
 def battery() -> Model:
-    """Lithium cell: charge and one polarisation voltage. The current sensor has an unknown bias d.
+    """Lithium cell under a charger whose current is known; the pack's own current sensor has an unknown bias d.
 
     Plett, Battery Management Systems, vol. I, chapter 2: open-circuit voltage from a table, one RC pair. 2.3 A h,
     R0 = 10 mOhm, R1 = 15 mOhm, 60 s; 10 s a step.
@@ -29,19 +29,20 @@ def battery() -> Model:
         return [charge - dt / capacity * u[0], keep * polarisation + r1 * (1 - keep) * u[0]]
 
     def g(x, u):
-        return [jnp.interp(x[0], soc, ocv) - x[1] - r0 * u[0]]
+        return [jnp.interp(x[0], soc, ocv) - x[1] - r0 * u[0], u[0]]
 
-    G = np.array([[dt / capacity], [-r1 * (1 - keep)]])  # the true current is u - d
-    system = gx.System(f, g, G=G, H=[[r0]], m=1, state_bounds=Interval([0.0, -0.5], [1.0, 0.5]))
+    system = gx.System(
+        f, g, G=np.zeros((2, 1)), H=[[0.0], [1.0]], m=1, state_bounds=Interval([0.0, -0.5], [1.0, 0.5])
+    )
     return Model(
         system,
-        gx.Noise(w=symmetric(1e-6, 1e-5), v=symmetric(1e-3)),
-        initial=Interval([0.5, -0.02], [0.9, 0.02]),
-        region=Interval([0.2, -0.1], [0.95, 0.1]),
+        gx.Noise(w=symmetric(1e-6, 1e-5), v=symmetric(1e-3, 0.02)),
+        initial=Interval([0.3, -0.1], [1.0, 0.1]),
+        region=Interval([0.1, -0.1], [0.95, 0.1]),
         d=lambda k: jnp.where(k < 100, 0.1, -0.2)[:, None],  # A
-        u=lambda k, x: jnp.array([1.5]) + jnp.sin(0.2 * k),
+        u=lambda k, x: jnp.array([0.5]) + jnp.sin(0.2 * k),
         u_region=Interval([-5.0], [5.0]),
-        wide=[0.1, 0.05],
+        wide=[0.01, 0.001],
     )
 
 

@@ -85,7 +85,10 @@ def building() -> Model:
         return x + scale * (60.0 * (u[0] - x) - 100.0 * walls @ x + radiators)
 
     seen = np.array([0, 1, 3, 4])
-    system = gx.System(f, lambda x: x[seen], G=scale * np.eye(5, 1), H=np.zeros((4, 1)), m=1)
+    system = gx.System(
+        f, lambda x: x[seen], G=scale * np.eye(5, 1), H=np.zeros((4, 1)), m=1,
+        state_bounds=Interval(np.full(5, -20.0), np.full(5, 50.0)),
+    )  # fmt: skip
     return Model(
         system,
         gx.Noise(w=symmetric(*[2e-3] * 5), v=symmetric(*[0.1] * 4)),

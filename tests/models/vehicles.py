@@ -130,7 +130,10 @@ def range_bearing() -> Model:
         return out
 
     turn = 2 * math.pi
-    system = gx.System(f, g, G=[[0.0], [0.0], [dt]], H=np.zeros((4, 1)), m=2, periodic={1: turn, 3: turn})
+    system = gx.System(
+        f, g, G=[[0.0], [0.0], [dt]], H=np.zeros((4, 1)), m=2, periodic={1: turn, 3: turn},
+        input_bounds=symmetric(2.0), state_bounds=Interval([-5.0, -5.0, -INF], [5.0, 8.0, INF]),
+    )  # fmt: skip
     return Model(
         system,
         gx.Noise(w=symmetric(0.005, 0.005, 0.002), v=symmetric(0.1, 0.02, 0.1, 0.02)),
@@ -151,8 +154,9 @@ def heading() -> Model:
         return [x[0] + dt * speed * jnp.sin(x[2]), x[1] + dt * speed * jnp.cos(x[2]), x[2]]
 
     system = gx.System(
-        f, lambda x: [x[0], x[1], x[2]], G=[[0.0], [0.0], [dt]], H=np.zeros((3, 1)), periodic={2: 2 * math.pi}
-    )
+        f, lambda x: [x[0], x[1], x[2]], G=[[0.0], [0.0], [dt]], H=np.zeros((3, 1)), periodic={2: 2 * math.pi},
+        input_bounds=symmetric(0.5),
+    )  # fmt: skip
     return Model(
         system,
         gx.Noise(w=symmetric(0.2, 0.2, 0.002), v=symmetric(3.0, 3.0, math.radians(1.0))),
