@@ -17,8 +17,8 @@ _NONE = inspect.Parameter.empty
 def takes_u(function: Callable[..., Any], name: str, m: int | None) -> bool:
     """Is the map called as ``function(x, u)``, or as ``function(x)``? Decided by its signature and by m alone.
 
-    A second parameter without a default is the known input. One with a default is passed where there are known inputs
-    (m > 0) if it is called ``u``; another name could be a parameter of the model, so it is refused then.
+    A second parameter without a default is the known input. One with a default is, where there are known inputs
+    (m > 0), if it is called ``u``; under any other name it is a parameter of the model and keeps its value.
 
     Args:
         function: f or g.
@@ -26,7 +26,7 @@ def takes_u(function: Callable[..., Any], name: str, m: int | None) -> bool:
         m: number of known inputs; None where it is not known yet.
 
     Raises:
-        ValueError: it is no function, or cannot be called with x or (x, u), or it is unclear which.
+        ValueError: it is no function, or cannot be called with x or (x, u).
     """
     if not callable(function):
         raise ValueError(f"System: `{name}` must be a function of x or of (x, u), got {type(function).__name__}")
@@ -45,16 +45,18 @@ def takes_u(function: Callable[..., Any], name: str, m: int | None) -> bool:
         )
     if len(required) == 2:
         return True
-    if not m:
-        return False
     optional = places[1:2]
-    if optional and optional[0].name != "u":
-        raise ValueError(
-            f"System: there are {m} known inputs, and it is unclear whether the optional argument "
-            f"`{optional[0].name}` of `{name}` is meant for them. Call it `u` if it is; if not, bind it with "
-            f"functools.partial({name}, {optional[0].name}=...)"
-        )
-    return bool(optional) or many
+    return bool(m) and (optional[0].name == "u" if optional else many)
+
+
+def not_passed(function: Callable[..., Any]) -> str:
+    """A hint for known inputs that reach nothing: an optional argument that could be meant for them."""
+    try:
+        places = [p for p in inspect.signature(function).parameters.values() if p.kind in _POSITIONAL]
+    except (TypeError, ValueError):
+        return ""
+    optional = [p for p in places[1:2] if p.default is not _NONE and p.name != "u"]
+    return f" The optional argument `{optional[0].name}` is not passed: call it `u` if it is meant." if optional else ""
 
 
 def _check_keywords(function: Callable[..., Any], name: str, parameters: list[inspect.Parameter]) -> None:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval, is_concrete
-from gsisio_jax.plant.calls import as_vector, check_map, takes_u
+from gsisio_jax.plant.calls import as_vector, check_map, not_passed, takes_u
 from gsisio_jax.plant.captured import Captured, captured, changed
 from gsisio_jax.plant.periodic import Periods, check_feedthrough, check_states, read_periods, turns
 
@@ -24,7 +24,7 @@ class System(eqx.Module):
 
     Args:
         f: state map, a JAX function of ``x`` (n,) or of ``(x, u)``; returns (n,), or a list of n numbers. A second
-            argument without a default is the known input; with one (``u=...``) it is passed where m > 0.
+            argument without a default is the known input; ``u=...`` is, where m > 0; others keep their defaults.
         g: output map, a JAX function of ``x`` or of ``(x, u)``; returns (l,), or a list of l numbers.
         G: how the unknown input enters the state, shape (n, p); p = 0 is a plain observer.
         H: how the unknown input enters the output (feedthrough), shape (l, p), any rank.
@@ -45,9 +45,8 @@ class System(eqx.Module):
 
     Raises:
         ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
-            the wrong shape, it is unclear whether f or g takes u, known inputs have no effect, or a bound does not
-            fit; an index or a period cannot be, an unbounded input enters a periodic output, or f or g change with a
-            periodic state.
+            the wrong shape, known inputs have no effect, or a bound does not fit; an index or a period cannot be, an
+            unbounded input enters a periodic output, or f or g change with a periodic state.
 
     Source: paper, (eq:system); theory 1 and 8.4.
     """
@@ -91,7 +90,7 @@ class System(eqx.Module):
             )
         m = _known_inputs(B, D, m)
         self.f_takes_u, self.g_takes_u = takes_u(f, "f", m), takes_u(g, "g", m)
-        m = _checked_inputs(m, self.f_takes_u or self.g_takes_u, B, D)
+        m = _checked_inputs(m, self.f_takes_u or self.g_takes_u, B, D, not_passed(f) or not_passed(g))
         self.B = np.zeros((self.n, m)) if B is None else _matrix("B", B, (self.n, m))
         self.D = np.zeros((self.l, m)) if D is None else _matrix("D", D, (self.l, m))
         _check_rank(self.G, self.H)
@@ -222,7 +221,7 @@ def _known_inputs(B: Any, D: Any, m: int | None) -> int | None:
     return sizes.pop() if sizes else None
 
 
-def _checked_inputs(m: int | None, used: bool, B: Any, D: Any) -> int:
+def _checked_inputs(m: int | None, used: bool, B: Any, D: Any, hint: str) -> int:
     if m is None and used:
         raise ValueError(
             "System: f or g takes u, but B and D are not given; say how many known inputs there are: m=..."
@@ -230,7 +229,7 @@ def _checked_inputs(m: int | None, used: bool, B: Any, D: Any) -> int:
     if m and not used and all(matrix is None or not np.any(matrix) for matrix in (B, D)):
         raise ValueError(
             f"System: there are {m} known inputs, but neither f, g, B nor D takes u, so they would have no effect. "
-            "Give f or g a second argument u, or a matrix B or D that is not zero; or leave out m"
+            f"Give f or g a second argument u, or a matrix B or D that is not zero; or leave out m.{hint}"
         )
     return m or 0
 

@@ -104,7 +104,7 @@ def test_a_direction_that_slopes_hide_is_explained():
         gx.design_observer(system, _noise(2, 3, 1e-3), region=region, missing=False)
     text = str(error.value)
     shown, varies = re.search(r"singular values ([\d.]+), [\d.]+, while .* vary by up to \+-(\d+\.\d+)", text).groups()
-    assert float(varies) > 0.5 * float(shown)
+    assert float(varies) > 0.3 * float(shown)
     for words in ("smaller region", "more outputs", "certify=False"):
         assert words in text, text
     scale = float(text.split("Scaled by ")[1].split(" ")[0])
