@@ -31,9 +31,7 @@ def battery() -> Model:
     def g(x, u):
         return [jnp.interp(x[0], soc, ocv) - x[1] - r0 * u[0], u[0]]
 
-    system = gx.System(
-        f, g, G=np.zeros((2, 1)), H=[[0.0], [1.0]], m=1, state_bounds=Interval([0.0, -0.5], [1.0, 0.5])
-    )
+    system = gx.System(f, g, G=np.zeros((2, 1)), H=[[0.0], [1.0]], m=1, state_bounds=Interval([0.0, -0.5], [1.0, 0.5]))
     return Model(
         system,
         gx.Noise(w=symmetric(1e-6, 1e-5), v=symmetric(1e-3, 0.02)),

@@ -117,9 +117,10 @@ def attitude() -> Model:
         system,
         gx.Noise(w=symmetric(*[1e-4] * 4), v=symmetric(*[0.003] * 6)),
         initial=Interval(start - 0.03, start + 0.03),
-        region=Interval(start - 0.05, start + 0.05),
-        u=lambda k, x: 0.005 * jnp.array([jnp.sin(0.2 * k), jnp.cos(0.15 * k), jnp.sin(0.1 * k)]),
-        u_region=symmetric(0.005, 0.005, 0.005),
+        region=Interval(start - 0.07, start + 0.07),
+        u=lambda k, x: 0.003 * jnp.array([jnp.sin(0.2 * k), jnp.cos(0.15 * k), jnp.sin(0.1 * k)]),
+        u_region=symmetric(0.003, 0.003, 0.003),
+        design={"gains": 4},
         wide=[0.05] * 4,
     )
 

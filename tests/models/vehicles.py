@@ -97,12 +97,16 @@ def range_only() -> Model:
     def g(x):
         return jnp.linalg.norm(x - beacons, axis=1)
 
-    system = gx.System(f, g, G=dt * np.eye(2), H=np.zeros((4, 2)), m=2)
+    harbour = Interval([0.0, 0.0], [200.0, 200.0])
+    system = gx.System(
+        f, g, G=dt * np.eye(2), H=np.zeros((4, 2)), m=2, input_bounds=symmetric(2.0, 2.0),
+        state_bounds=harbour,
+    )  # fmt: skip
     return Model(
         system,
         gx.Noise(w=symmetric(0.05, 0.05), v=symmetric(*[0.5] * 4)),
-        initial=Interval([60.0, 60.0], [140.0, 140.0]),
-        region=Interval([80.0, 80.0], [150.0, 150.0]),
+        initial=Interval([80.0, 80.0], [120.0, 120.0]),
+        region=Interval([60.0, 60.0], [150.0, 150.0]),
         d=lambda k: 0.5 * jnp.stack([jnp.cos(0.05 * k), jnp.sin(0.05 * k)], axis=1),  # m/s
         u=lambda k, x: jnp.array([1.0, 0.1 * k]),
         u_region=Interval([1.0, 0.0], [1.0, 20.0]),
