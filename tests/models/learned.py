@@ -5,10 +5,10 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 import numpy as np
+from models.runner import Model, symmetric
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from models.runner import Model, symmetric
 
 INF = np.inf
 
