@@ -1,4 +1,4 @@
-"""Twenty models, written as an engineer writes them: no state and no unknown input outside its box, and useful boxes."""
+"""Twenty models, written as an engineer writes them: nothing outside its box, and useful boxes."""
 
 import numpy as np
 import pytest
