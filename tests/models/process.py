@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 import numpy as np
+from models.runner import Model, symmetric
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from models.runner import Model, symmetric
 
 
 def cstr() -> Model:

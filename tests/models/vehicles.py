@@ -6,10 +6,10 @@ import math
 
 import jax.numpy as jnp
 import numpy as np
+from models.runner import Model, symmetric
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from models.runner import Model, symmetric
 
 INF = np.inf
 
