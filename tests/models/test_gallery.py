@@ -9,8 +9,6 @@ from models.runner import estimate, misses, records
 BOTH_PRECISIONS = ("engine", "battery", "heading")
 # Products of rounded numbers alone, and a division: what rounding to nearest leaves out.
 BOTH_ROUNDINGS = ("sir", "cstr")
-# Certain, but far wider than the outputs and the certificate allow: more outputs than states, none of them linear.
-TOO_WIDE = ("attitude", "range_only")
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -110,7 +110,8 @@ def range_only() -> Model:
         d=lambda k: 0.5 * jnp.stack([jnp.cos(0.05 * k), jnp.sin(0.05 * k)], axis=1),  # m/s
         u=lambda k, x: jnp.array([1.0, 0.1 * k]),
         u_region=Interval([1.0, 0.0], [1.0, 20.0]),
-        wide=[2.0, 2.0],
+        design={"sweeps": 3},
+        wide=[11.0, 11.0],
     )
 
 
