@@ -98,7 +98,7 @@ def _attributes(value: Any) -> dict[str, Any]:
 def _members(names: dict[Any, Any], seen: set[int], depth: int) -> Iterator[tuple[str, Any]]:
     for name, value in names.items():
         if isinstance(value, np.ndarray | np.generic | float | int | complex | jax.Array):
-            if not isinstance(value, Tracer) and not np.asarray(value).dtype != np.object_:
+            if not isinstance(value, Tracer) and np.asarray(value).dtype != np.object_:
                 yield str(name), value
         elif depth <= 0:
             continue

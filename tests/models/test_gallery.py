@@ -23,9 +23,7 @@ def test_model(name):
         assert not np.asarray(boxes.status & 1).any(), boxes.alarms()
         widths = np.asarray(boxes.state.width)[-20:]
         typical = np.median(widths, axis=0)  # lost measurements, and turns out of the region, widen single boxes
-        assert (typical <= 1.01 * np.asarray(model.wide)).all() == (name not in TOO_WIDE), (
-            typical
-        )  # 1: where noise alone decides, rounded
+        assert (typical <= 1.01 * np.asarray(model.wide)).all(), typical  # 1: where noise alone decides, rounded
         if model.system.p:
             assert np.isfinite(np.asarray(boxes.input.width)).any(0).all()
     if name in BOTH_PRECISIONS:
