@@ -111,7 +111,7 @@ def range_only() -> Model:
         u=lambda k, x: jnp.array([1.0, 0.1 * k]),
         u_region=Interval([1.0, 0.0], [1.0, 20.0]),
         design={"missing": True},
-        wide=[2.0, 2.0],
+        wide=[15.0, 15.0],
     )
 
 
