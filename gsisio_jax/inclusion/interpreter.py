@@ -146,8 +146,8 @@ def _constant(eqn: Any, args: Sequence[Any]) -> Any:
 
 
 def _aligned(args: Sequence[Any], shape: tuple[int, ...]) -> list[Any]:
-    """JAX lets a scalar meet an array; slopes and Jacobians have one axis more, so their scalars must be spread."""
-    spread = [is_node(arg) and arg.shape == () and shape != () for arg in args]
+    """JAX lets scalars and axes of length 1 meet an array; slopes and Jacobians have one axis more: spread them."""
+    spread = [is_node(arg) and arg.shape != shape for arg in args]
     return [
         linear.move(lambda v: jnp.broadcast_to(v, shape), arg) if wide else arg
         for arg, wide in zip(args, spread, strict=True)

@@ -45,7 +45,7 @@ def battery() -> Model:
 
 
 def engine() -> Model:
-    """Mean-value engine: manifold pressure (bar), speed (1000/min), maps of breathing and torque; the load is unknown.
+    """Mean-value engine: manifold pressure (bar) and speed (1000/min), maps of breathing and torque; unknown load.
 
     Heywood, Internal Combustion Engine Fundamentals, section 7.6, for the form; maps of a 2 L engine, rounded. 20 ms.
     """

@@ -120,8 +120,8 @@ def attitude() -> Model:
         region=Interval(start - 0.07, start + 0.07),
         u=lambda k, x: 0.003 * jnp.array([jnp.sin(0.2 * k), jnp.cos(0.15 * k), jnp.sin(0.1 * k)]),
         u_region=symmetric(0.003, 0.003, 0.003),
-        design={"gains": 4},
-        wide=[0.05] * 4,
+        design={"missing": True},
+        wide=[0.15] * 4,
     )
 
 

@@ -21,6 +21,8 @@ INWARD = 1 - 1e-4  # of the drawn noise: room for the rounding of a record to fl
 class Model:
     """A plant as an engineer writes it, and a run of it.
 
+    Designs make one sweep and have no gains for lost measurements, as compiling takes most of the time; models
+    whose boxes need more say so in `design`.
     `d` takes the step (an integer array) and gives (steps, p); `u` takes step and true state and gives (m,): the
     controller of the simulation, whose inputs are recorded. `wide` bounds the last widths (n,): what a user expects.
     """

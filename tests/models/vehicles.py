@@ -110,12 +110,13 @@ def range_only() -> Model:
         d=lambda k: 0.5 * jnp.stack([jnp.cos(0.05 * k), jnp.sin(0.05 * k)], axis=1),  # m/s
         u=lambda k, x: jnp.array([1.0, 0.1 * k]),
         u_region=Interval([1.0, 0.0], [1.0, 20.0]),
-        wide=[2.0, 2.0],
+        design={"missing": True},
+        wide=[15.0, 15.0],
     )
 
 
 def range_bearing() -> Model:
-    """Unicycle with distance and bearing of two landmarks, bearings modulo a turn; an unknown slip turns it.
+    """Unicycle with distances of two landmarks and the bearing of one, modulo a turn; an unknown slip turns it.
 
     Thrun, Burgard, Fox, Probabilistic Robotics, section 6.6: range and bearing of landmarks.
     """
@@ -127,26 +128,23 @@ def range_bearing() -> Model:
         return [x[0] + dt * v * jnp.cos(x[2]), x[1] + dt * v * jnp.sin(x[2]), x[2] + dt * turn]
 
     def g(x):
-        out = []
-        for east, north in landmarks:
-            dx, dy = east - x[0], north - x[1]
-            out += [jnp.hypot(dx, dy), jnp.arctan2(dy, dx) - x[2]]
-        return out
+        near, far = landmarks - x[:2]
+        return [jnp.hypot(near[0], near[1]), jnp.arctan2(near[1], near[0]) - x[2], jnp.linalg.norm(far)]
 
     turn = 2 * math.pi
     system = gx.System(
-        f, g, G=[[0.0], [0.0], [dt]], H=np.zeros((4, 1)), m=2, periodic={1: turn, 3: turn},
+        f, g, G=[[0.0], [0.0], [dt]], H=np.zeros((3, 1)), m=2, periodic={1: turn},
         input_bounds=symmetric(2.0), state_bounds=Interval([-5.0, -5.0, -INF], [5.0, 8.0, INF]),
     )  # fmt: skip
     return Model(
         system,
-        gx.Noise(w=symmetric(0.005, 0.005, 0.002), v=symmetric(0.1, 0.02, 0.1, 0.02)),
+        gx.Noise(w=symmetric(0.005, 0.005, 0.002), v=symmetric(0.1, 0.02, 0.1)),
         initial=symmetric(0.5, 0.5, 0.3),
         region=Interval([-2.0, -1.0, -1.0], [2.0, 3.0, 20.0]),
         d=lambda k: 0.5 * jnp.sin(0.1 * k)[:, None],  # rad/s
         u=lambda k, x: jnp.array([0.5, 0.5]),
         u_region=Interval([0.5, 0.5], [0.5, 0.5]),
-        wide=[0.25, 0.25, 0.06],
+        wide=[0.3, 0.3, 0.15],
     )
 
 

@@ -101,8 +101,7 @@ def _norm(eqn: Any, x: Any) -> list[Any] | None:
             rest = tuple(n for axis, n in enumerate(sample.shape) if axis not in axes)
 
             def rows(v: Any, axes: Any = axes, count: int = count, rest: Any = rest) -> Any:
-                whole = jnp.broadcast_to(v, sample.shape)  # slopes common to all entries come with axes of length 1
-                return jnp.moveaxis(whole, axes, range(len(axes))).reshape(count, *rest)
+                return jnp.moveaxis(v, axes, range(len(axes))).reshape(count, *rest)
 
             return [move(lambda v: v.reshape(found.shape), vectors.norm(move(rows, x)))]
     return None
