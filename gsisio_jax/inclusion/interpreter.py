@@ -72,11 +72,12 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
         try:
             operands, rule = [read(atom) for atom in eqn.invars], None
             match = known.get(place) if eqn.primitive.name not in _BY_HAND else None
-            out = None if match is None else _recognised(match, read)
+            given = [read(atom) for atom in match.operands] if match is not None else []
+            out = _recognised(match, given)
             if out is None:
                 out = _watched(eqn, operands)
             elif match is not None:
-                rule, operands = match.rule, [read(atom) for atom in match.operands]
+                rule, operands = match.rule, given
         except UnknownPrimitiveError as error:
             if error.place is not None or (line := _caller(eqn)) is None:
                 raise
@@ -105,9 +106,8 @@ def _watched(eqn: Any, args: Sequence[Any]) -> Any:
         _PLACES.reset(token)
 
 
-def _recognised(match: Any, read: Callable[[Any], Any]) -> Any:
-    """The value of an equation that ends a known expression."""
-    operands = [read(atom) for atom in match.operands]
+def _recognised(match: Any, operands: Sequence[Any]) -> Any:
+    """The value of an equation that ends a known expression of these operands; None where it ends none."""
     value = match.rule(*map(normalised, operands)) if any(map(is_node, operands)) else None
     return None if value is None else normalise(value)
 

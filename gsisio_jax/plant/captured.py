@@ -76,7 +76,8 @@ def _read_by(function: FunctionType) -> dict[str, Any]:
     return {name: value for name, value in names.items() if name not in stored}
 
 
-def _names(code: CodeType) -> tuple[set[str], set[str]]:
+@functools.lru_cache(maxsize=256)  # the code of a function does not change, and every call of `estimate` asks
+def _names(code: CodeType) -> tuple[frozenset[str], frozenset[str]]:
     read, stored = set(), set()
     for step in dis.get_instructions(code):
         if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
@@ -88,7 +89,7 @@ def _names(code: CodeType) -> tuple[set[str], set[str]]:
             inner = _names(constant)
             read |= inner[0]
             stored |= inner[1]
-    return read, stored
+    return frozenset(read), frozenset(stored)
 
 
 def _attributes(value: Any) -> dict[str, Any]:

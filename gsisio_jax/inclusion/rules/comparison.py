@@ -32,10 +32,11 @@ from gsisio_jax.inclusion.node import (
 from gsisio_jax.inclusion.rules.bilinear import divide, multiply, pick
 from gsisio_jax.inclusion.rules.functions import RELU, SOFTPLUS
 from gsisio_jax.inclusion.rules.linear import add, negative, structural, subtract
+from gsisio_jax.inclusion.rules.possible import hull_of_cases
 from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, hull
-from gsisio_jax.interval.minmax import larger, smaller
+from gsisio_jax.interval.minmax import larger
 
 LOG_ADD_EXP_ULPS = 512.0
 
@@ -260,7 +261,7 @@ def select(which: Any, *cases: Any) -> Any:
         upper = jnp.stack([p & v.range.upper for p, v in zip(possible, nodes, strict=True)]).any(0)
         return step(Interval.unchecked(lower, upper), [which, *cases])
     box, jac = parts([which, *nodes])
-    natural = _possible_hull(possible, [v.range for v in nodes])
+    natural = hull_of_cases(possible, [v.range for v in nodes])
     form = None
     if box is not None:
         # One slope for all cases: the mean, or that of the case that is decided. What a case has more or less of it
@@ -274,10 +275,10 @@ def select(which: Any, *cases: Any) -> Any:
         if rounding.outward():
             # What every case lost; the rounding of ``own - slope`` is in the image above.
             slack = sum_slack(*(v.form.slack for v in nodes if v.form is not None))
-        form = best_form(slope, _possible_hull(possible, offsets), natural, box, slack)
+        form = best_form(slope, hull_of_cases(possible, offsets), natural, box, slack)
     if jac is not None:
         size = jac.lower.shape[0]
-        jac = _possible_hull(possible, [jac_of(v, size) for v in nodes])
+        jac = hull_of_cases(possible, [jac_of(v, size) for v in nodes])
         if which.jac is not None:
             # The selection may change inside the box, and the cases need not agree where it does.
             decided = sum(single[1:], single[0].astype(int)) > 0
@@ -290,11 +291,3 @@ def _select_plain(which: Any, *cases: Any) -> Any:
     for i, case in enumerate(cases[1:], 1):
         result = jnp.where(which if jnp.asarray(which).dtype == bool else which == i, case, result)
     return result
-
-
-def _possible_hull(possible: Sequence[Any], cases: Sequence[Interval]) -> Interval:
-    lower, upper = jnp.inf, -jnp.inf
-    for mask, case in zip(possible, cases, strict=True):
-        lower = smaller(lower, jnp.where(mask, case.lower, jnp.inf))
-        upper = larger(upper, jnp.where(mask, case.upper, -jnp.inf))
-    return Interval.unchecked(lower, upper)

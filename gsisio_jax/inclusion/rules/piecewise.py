@@ -44,9 +44,10 @@ from gsisio_jax.inclusion.node import (
 )
 from gsisio_jax.inclusion.origin import Again, NotAgain, origin
 from gsisio_jax.inclusion.rules.linear import move, subtract
+from gsisio_jax.inclusion.rules.possible import hull_of_cases
 from gsisio_jax.inclusion.rules.switches import Switch, switch_in, switch_of
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, entire_like
+from gsisio_jax.interval.box import Interval, choose, entire_like, intersect
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import times
 
@@ -79,7 +80,7 @@ def by_pieces(eqn: Any, args: Sequence[Any], plain: Node, apply: Apply, elementw
     try:
         single = switch.pivot.range.lower.size == 1
         again = partial(Again, apply, None if single else elementwise)
-        jumps = [_jump(eqn, args, again, switch, i) for i in range(len(switch.cuts))]
+        jumps = [_jump(eqn, args, again, switch, i, plain) for i in range(len(switch.cuts))]
         cases = [_on_segment(eqn, args, again, switch, i, plain) for i in range(len(switch.between))]
         cases += [_at_cut(eqn, args, again, switch, i, plain) for i in range(len(switch.cuts)) if _alone(switch, i)]
     except NotAgain:
@@ -93,10 +94,6 @@ def _fits(switch: Switch) -> bool:
     return jnp.issubdtype(switch.pivot.dtype, jnp.floating) and all(np.isfinite(c).all() for c in switch.cuts)
 
 
-def _value(switch: Switch, value: Any) -> np.ndarray:
-    return np.full(switch.node.shape, value, switch.node.dtype)
-
-
 class _Jump(NamedTuple):
     """Differences between the value at a cut and those just below and above it, and the size of the value."""
 
@@ -105,17 +102,25 @@ class _Jump(NamedTuple):
     size: Any
 
 
-def _jump(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int) -> _Jump:
+def _evaluated(
+    eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, pivot: Node, value: Any, plain: Node
+) -> Node:
+    """The result for another pivot, and with that value of the switch."""
+    fixed = np.full(switch.node.shape, value, switch.node.dtype)
+    found = again([(switch.pivot, pivot), (switch.node, fixed)]).equation(eqn, args)
+    return normalised(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
+
+
+def _jump(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int, plain: Node) -> _Jump:
     pivot = switch.pivot
     cut = np.broadcast_to(switch.cuts[i], pivot.shape).astype(pivot.dtype)
     thin = Node(Interval.unchecked(cut, cut))
     known = _only_constants(args, pivot)
     with jax.ensure_compile_time_eval() if known else nullcontext():
-        values = []
-        for value in (switch.at[i], switch.between[i], switch.between[i + 1]):
-            found = again([(pivot, thin), (switch.node, _value(switch, value))]).equation(eqn, args)
-            dtype = eqn.outvars[0].aval.dtype
-            values.append(normalised(found) if is_node(found) else as_node(found, eqn.outvars[0].aval.shape, dtype))
+        values = [
+            _evaluated(eqn, args, again, switch, thin, value, plain)
+            for value in (switch.at[i], switch.between[i], switch.between[i + 1])
+        ]
         gaps = [normalised(subtract(values[0], other)).range for other in values[1:]]
         jumps = [jnp.maximum(abs(gap.lower), abs(gap.upper)) for gap in gaps]
         size = jnp.maximum(abs(values[0].range.lower), abs(values[0].range.upper))
@@ -166,9 +171,7 @@ def _on_segment(
     stand_in = jnp.asarray(cuts[min(i, len(cuts) - 1)], low.dtype)
     box = choose(possible, Interval.unchecked(first, last), Interval.unchecked(stand_in, stand_in))
     cut_down = Node(box, _loose(pivot.form), pivot.jac)
-    replaced = [(switch.pivot, cut_down), (switch.node, _value(switch, switch.between[i]))]
-    found = again(replaced).equation(eqn, args)
-    node = normalised(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
+    node = _evaluated(eqn, args, again, switch, cut_down, switch.between[i], plain)
     return _Case(jnp.broadcast_to(possible, plain.shape), box, node)
 
 
@@ -182,9 +185,7 @@ def _at_cut(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch
     cut = jnp.broadcast_to(jnp.asarray(switch.cuts[i], pivot.dtype), pivot.shape)
     possible = (pivot.range.lower <= cut) & (cut <= pivot.range.upper)
     thin = Interval.unchecked(cut, cut)
-    replaced = [(switch.pivot, Node(thin, _loose(pivot.form), pivot.jac)), (switch.node, _value(switch, switch.at[i]))]
-    found = again(replaced).equation(eqn, args)
-    node = normalised(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
+    node = _evaluated(eqn, args, again, switch, Node(thin, _loose(pivot.form), pivot.jac), switch.at[i], plain)
     return _Case(jnp.broadcast_to(possible, plain.shape), thin, node)
 
 
@@ -201,7 +202,8 @@ def _hull(plain: Node, switch: Switch, cases: Sequence[_Case], jumps: Sequence[_
     tolerance = max(_CONTINUOUS, 64 * float(jnp.finfo(plain.dtype).eps))
     small = [[jump <= tolerance * jnp.maximum(j.size, 1) for jump in (j.below, j.above)] for j in jumps]
     slip = sum(jnp.where(ok[0], j.below, 0) + jnp.where(ok[1], j.above, 0) for ok, j in zip(small, jumps, strict=True))
-    natural = _met(_hull_of([(case.possible, case.node.range) for case in cases]), plain.range)
+    possible = [case.possible for case in cases]
+    natural, _ = intersect(hull_of_cases(possible, [case.node.range for case in cases]), plain.range)
     extra = rounding.generous(2 * slip) if rounding.outward() else 2 * slip
     natural = Interval.unchecked(natural.lower - extra, natural.upper + extra)
     box, jac = parts([plain, *(case.node for case in cases)])
@@ -211,28 +213,13 @@ def _hull(plain: Node, switch: Switch, cases: Sequence[_Case], jumps: Sequence[_
         form = _common_form(wide, cases, natural, extra, box)
     if jac is not None:
         size = jac.lower.shape[0]
-        jac = _hull_of([(case.possible, jac_of(case.node, size)) for case in cases])
+        jac = hull_of_cases(possible, [jac_of(case.node, size) for case in cases])
         cuts = switch.cuts if pivot.jac is not None else ()  # what does not depend on x does not jump in x
         low, high = pivot.range.lower, pivot.range.upper
         for ok, cut in zip(small, cuts, strict=False):
             smooth = (~((low < cut) & (cut <= high)) | ok[0]) & (~((low <= cut) & (cut < high)) | ok[1])
             jac = choose(jnp.broadcast_to(smooth, jac.lower.shape), jac, entire_like(jac.lower))
     return Node(natural, form, jac)
-
-
-def _hull_of(boxes: Sequence[tuple[Any, Interval]]) -> Interval:
-    """Hull of those that are possible."""
-    lower, upper = jnp.inf, -jnp.inf
-    for possible, box in boxes:
-        lower = smaller(lower, jnp.where(possible, box.lower, jnp.inf))
-        upper = larger(upper, jnp.where(possible, box.upper, -jnp.inf))
-    return Interval.unchecked(lower, upper)
-
-
-def _met(a: Interval, b: Interval) -> Interval:
-    """Intersection; the first where rounding makes the two miss each other."""
-    lower, upper = larger(a.lower, b.lower), smaller(a.upper, b.upper)
-    return choose(lower <= upper, Interval.unchecked(lower, upper), a)
 
 
 def _common_form(pivot: Node, cases: Sequence[_Case], natural: Interval, extra: Any, box: Any) -> Form:
@@ -265,8 +252,9 @@ def _common_form(pivot: Node, cases: Sequence[_Case], natural: Interval, extra: 
         )
         scaled = choose(part == 0, Interval.unchecked(0 * part, 0 * part), scaled)
         offset = box_sum(box_sum(case.node.offset, slope_image(left, box)), scaled)
-        offsets.append((case.possible, Interval.unchecked(offset.lower - extra, offset.upper + extra)))
-    return best_form(slope, _hull_of(offsets), natural, box, slack if rounding.outward() else None)
+        offsets.append(Interval.unchecked(offset.lower - extra, offset.upper + extra))
+    offset = hull_of_cases([case.possible for case in cases], offsets)
+    return best_form(slope, offset, natural, box, slack if rounding.outward() else None)
 
 
 def _shares(cases: Sequence[_Case]) -> list[Any]:

@@ -6,6 +6,7 @@ choice may jump is said by the caller: a sorted array does not, though its entri
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from gsisio_jax.inclusion.form_arithmetic import box_sum, slope_image
 from gsisio_jax.inclusion.node import Node, best_form, normalised, parts, slack_of, slope_of
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like
+from gsisio_jax.interval.minmax import larger, smaller
 
 
 def hull_of_rows(possible: Any, rows: Node, jumps: Any = None) -> Node:
@@ -50,6 +52,15 @@ def _hull(possible: Any, values: Interval, axis: int = 0) -> Interval:
     return Interval.unchecked(
         jnp.where(possible, values.lower, jnp.inf).min(axis), jnp.where(possible, values.upper, -jnp.inf).max(axis)
     )
+
+
+def hull_of_cases(possible: Sequence[Any], cases: Sequence[Interval]) -> Interval:
+    """Hull of the boxes of a few cases, entry by entry of those that are possible (masks)."""
+    lower, upper = jnp.inf, -jnp.inf
+    for mask, case in zip(possible, cases, strict=True):
+        lower = smaller(lower, jnp.where(mask, case.lower, jnp.inf))
+        upper = larger(upper, jnp.where(mask, case.upper, -jnp.inf))
+    return Interval.unchecked(lower, upper)
 
 
 def unknown(shape: tuple[int, ...], dtype: Any, inputs: Any) -> Node:
