@@ -11,7 +11,7 @@ import numpy as np
 from gsisio_jax.design.feedthrough import Feedthrough
 from gsisio_jax.design.inputs import InputBounds
 from gsisio_jax.design.planes import plane_bounds
-from gsisio_jax.design.problem import GainProblem, beyond_rounding, without_rounding
+from gsisio_jax.design.problem import GainProblem, beyond_rounding, left_of_states
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.bank import LinearBounds
@@ -85,7 +85,7 @@ def assemble(
         return plane_bounds(system, function, region, plan.u_region) if "abstraction" in bounds else None
 
     stacked = np.stack(bank)
-    P = without_rounding(np.eye(problem.n) - stacked[:, :, l:] @ problem.C)
+    P = left_of_states(stacked[:, :, l:], problem.C)
     residual = np.asarray(system.G) - stacked @ problem.seen
     unfinished: Any = None
     return Observer(
@@ -127,7 +127,7 @@ def _certificate(
 ) -> Certificate:
     """What the first gain and the first left inverse promise on the region."""
     n, l = problem.n, problem.l
-    P = without_rounding(np.eye(n) - main[:, l:] @ problem.C)
+    P = left_of_states(main[:, l:], problem.C)
     N_y, N_z, N_s = problem.split(main)
     inverses = inputs.inverses
     J1, J2 = -inverses.residual[0][:, :n], -inverses.residual[0][:, n:]

@@ -182,6 +182,13 @@ def without_rounding(matrix: np.ndarray) -> np.ndarray:
     return np.where(np.abs(matrix) < 1e-13 * np.abs(matrix).max(initial=0.0), 0.0, matrix)
 
 
+def left_of_states(N_z: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """``P = I - N_z C`` for stacks of gains. Entries of the size that a solver leaves (1e-12) are 0, so that a bound
+    that needs no past box asks for none; what they miss of x[k] is counted with the rounding of the gains."""
+    P = np.eye(C.shape[1]) - N_z @ C
+    return np.where(np.abs(P) < 1e-11 * (1 + np.abs(N_z) @ np.abs(C)), 0.0, P)
+
+
 def beyond_rounding(radius: np.ndarray, center: np.ndarray) -> np.ndarray:
     """Radii of enclosures without those that only rounding gave a width: for the program that looks for gains, and for
     the widths that it expects. What the observer runs with has them."""

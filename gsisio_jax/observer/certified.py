@@ -12,7 +12,7 @@ from gsisio_jax.interval.box import Interval, choose, intersect
 from gsisio_jax.interval.image import plain_image
 from gsisio_jax.interval.primitives import matmul
 from gsisio_jax.observer.bank import Known
-from gsisio_jax.observer.contractors import centred_form
+from gsisio_jax.observer.contractors import Newton, centred_form
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.lost import plainly_wider
 from gsisio_jax.observer.maps import Maps, at_point
@@ -33,7 +33,15 @@ class Promised(NamedTuple):
 
 @jax.named_scope("certified")
 def certified(
-    maps: Maps, domain: Domain, past: States, carry: Carry, right: Interval, known: Known, left: Any, u: Any
+    maps: Maps,
+    domain: Domain,
+    past: States,
+    carry: Carry,
+    right: Interval,
+    known: Known,
+    left: Any,
+    newton: Newton,
+    u: Any,
 ) -> tuple[Domain, Promised | None]:
     """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""
     observer, certificate, before = maps.observer, maps.observer.certificate, carry.state
@@ -57,7 +65,8 @@ def certified(
     def psi(x: Any) -> tuple[Any, Any]:
         return at_point(maps.remainder, x, wider(abs(x), maps.terms), *maps.free_at(x, u))
 
-    box = centred_form(joint, gains.remainder[0], observer.region_inverse, psi, safe, maps.terms)
+    N_z, V, steps = gains.remainder[0], observer.region_inverse, observer.corrections
+    box = centred_form(joint, N_z, V, psi, safe, maps.terms, newton=newton if steps else None, corrections=steps)
     return domain.intersect(everything_unless(applies, box)[None], Source.CERTIFICATE), promised
 
 

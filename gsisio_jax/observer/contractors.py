@@ -69,7 +69,25 @@ def contract_affine_rows(states: States, form: Affine, z: Interval) -> tuple[Int
     return Interval.unchecked(jnp.where(usable, a, -jnp.inf), jnp.where(usable, b, jnp.inf)), slack
 
 
-def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, terms: int) -> Interval:
+class Newton(NamedTuple):
+    """Steps to the x of ``x + N_z psi(x) = right``: the solution by affine bounds of psi, its right side, and the
+    ``M = dx / d right`` of these bounds, with whether it is to be used."""
+
+    point: Any
+    right: Any
+    inverse: Any
+    usable: Any
+
+    def begin(self, right: Any) -> Any:
+        """x for another right side (n,)."""
+        return jnp.where(self.usable, self.point + matmul(self.inverse, right - self.right), right)
+
+    def improved(self, x: Any, missing: Any) -> Any:
+        """x moved by what it misses of the right side (n,)."""
+        return x + jnp.where(self.usable, matmul(self.inverse, missing), missing)
+
+
+def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, terms: int) -> tuple[Interval, Newton]:
     """Solve ``x + N_z psi(x) in right`` for x, for every gain.
 
     With ``psi(x) = D x + [e]``, ``A x in right - N_z [e]`` with ``A = I + N_z D``: one plain linear solve, by the
@@ -89,7 +107,7 @@ def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, term
         terms: of a row, for rounding.
 
     Returns:
-        Box (K, n) of x[k] for every gain; NaN where it overflowed.
+        Box (K, n) of x[k] for every gain; NaN where it overflowed. And the solution of the first gain as a point.
 
     Source: theory 5.3.
     """
@@ -98,10 +116,10 @@ def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, term
     small = identity + matmul(D, N_z)  # (K, q, q)
     B, E, verified = _verified_inverse(small)
     center, radius = _center_and_wider_radius(right, terms)
-    center = center - matmul(N_z, psi.center)
+    moved = center - matmul(N_z, psi.center)
     radius = radius + scale(abs(N_z), psi.radius).sum(-1)
     M = jnp.eye(n, dtype=D.dtype) - matmul(N_z, matmul(B, D))
-    middle = matmul(M, center[..., None])[..., 0]
+    middle = matmul(M, moved[..., None])[..., 0]
     spread = scale(abs(M), radius[:, None, :]).sum(-1)
     if rounding.outward():
         size, reached = abs(N_z), scale(abs(D), states.magnitude).sum(-1)
@@ -113,7 +131,8 @@ def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, term
             spread = spread + scale(size, matmul(left, reached[:, None])[:, None, :, 0]).sum(-1) * (1 + 2.0**-10)
         spread = spread + wider(states.magnitude + scale(size, bent[:, None, :]).sum(-1), terms + 2 * n + 2 * q)
     keep = verified[:, None]
-    return Interval.unchecked(jnp.where(keep, middle - spread, -jnp.inf), jnp.where(keep, middle + spread, jnp.inf))
+    box = Interval.unchecked(jnp.where(keep, middle - spread, -jnp.inf), jnp.where(keep, middle + spread, jnp.inf))
+    return box, Newton(middle[0], center[0], M[0], verified[0])
 
 
 def _center_and_wider_radius(box: Interval, terms: int) -> tuple[Any, Any]:
@@ -145,13 +164,22 @@ def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
 
 
 def centred_form(
-    right: Interval, N_z: Any, inverse: Any, remainder: Any, within: Interval, terms: int, left: Any = None
+    right: Interval,
+    N_z: Any,
+    inverse: Any,
+    remainder: Any,
+    within: Interval,
+    terms: int,
+    left: Any = None,
+    newton: Newton | None = None,
+    corrections: int = 1,
 ) -> Interval:
     """Bound x by its distance from one point c, where ``x + N_z psi(x) in right`` and x lies in `within`.
 
-    With ``mid +- rad = right``, ``b = clip(mid)`` and ``c = clip(mid - N_z psi(b))``, r = |c - b|: clipping is
+    With ``mid +- rad = right``, any b in `within` and ``c = clip(mid - N_z psi(b))``, r = |c - b|: clipping is
     nonexpansive, so ``|x - c| <= rad + |N_z| R |x - b| <= rad + |N_z| R (|x - c| + r)``, hence ``|x - c| <= V rad +
-    V |N_z| R r <= V (rad + r) - r`` for ``V (I - |N_z| R) >= I``.
+    V |N_z| R r <= V (rad + r) - r`` for ``V (I - |N_z| R) >= I``. The nearer b is to the solution of ``b + N_z psi(b)
+    = mid``, the smaller is r.
 
     Args:
         right: box (n,).
@@ -161,12 +189,18 @@ def centred_form(
         within: box (n,) on which R holds and in which x is known to lie.
         terms: of a row, for rounding.
         left: (n, n), what `right` leaves of x by rounding.
+        newton: where b comes from; without it ``b = clip(mid)``.
+        corrections: number of its steps. Every one after the first takes a value of psi.
 
     Source: theory 5.3 and 5.6.
     """
     middle, radius = _center_and_wider_radius(right, terms)
-    before = clip(middle, within)
+    before = clip(middle if newton is None else newton.begin(middle), within)
     center, error = remainder(before)
+    if newton is not None:
+        for _ in range(corrections - 1):
+            before = clip(newton.improved(before, middle - matmul(N_z, center) - before), within)
+            center, error = remainder(before)
     c = clip(middle - matmul(N_z, center), within)
     error = matmul(abs(N_z), error) + wider(abs(middle) + matmul(abs(N_z), abs(center)), terms)
     move = abs(c - before)

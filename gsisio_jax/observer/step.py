@@ -129,7 +129,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
             if sweep > 0 or observer.first.affine_output:
                 rows, slack = contract_affine_rows(states, form, known.z)
                 domain = domain.record_margin(slack, Source.OUTPUT)
-            solved = solve_remainder(observer.gains.remainder, right, psi, states, maps.terms)
+            solved, newton = solve_remainder(observer.gains.remainder, right, psi, states, maps.terms)
             domain = domain.intersect(solved, Source.STATE, quiet=rows)
             states = maps.states(domain.box)
 
@@ -139,7 +139,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         d, domain = from_inverses(maps, domain, states, d_fixed, psi)
         moved = moved_without(maps, past, carry, known.terms)
         domain = dynamics(maps, domain, moved, d)
-    domain, promised = certified(maps, domain, past, carry, right, known, left[0], u)
+    domain, promised = certified(maps, domain, past, carry, right, known, left[0], newton, u)
     with _stage("inputs"):
         states = maps.states(domain.box)
         d, domain = certified_input(maps, domain, states, promised, known, left[1], d)

@@ -122,6 +122,7 @@ class Observer(eqx.Module):
         bounds: the methods of Corollary 1 that bound f and g.
         sweeps: how often the box is contracted in a step.
         rounding_constants: what the gains leave by rounding.
+        corrections: Newton steps to the point that the certified bound is around (theory 5.6).
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
     """
 
@@ -146,6 +147,7 @@ class Observer(eqx.Module):
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     bounds: tuple[str, ...] = eqx.field(static=True)
     sweeps: int = eqx.field(static=True)
+    corrections: int = eqx.field(static=True, default=0)
     rounding: Rounding = eqx.field(static=True, default="outward")
 
     @property

@@ -1,0 +1,61 @@
+"""The width promise where slopes vary most: ranges to four beacons, and a gain that uses the new measurement alone."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import gsisio_jax as gx
+from gsisio_jax import Interval
+
+BEACONS = np.array([[0.0, 0], [200, 0], [0, 200], [200, 200]])
+LOWER, UPPER = np.array([60.0, 60]), np.array([150.0, 150])
+NOISE = gx.Noise(w=Interval.symmetric([0.05] * 2), v=Interval.symmetric([0.5] * 4))
+
+
+def test_widths_keep_the_promise_from_any_box_of_the_region():
+    system = gx.System(
+        lambda x: x,
+        lambda x: jnp.sqrt((x[0] - BEACONS[:, 0]) ** 2 + (x[1] - BEACONS[:, 1]) ** 2),
+        G=np.eye(2),
+        H=np.zeros((4, 2)),
+        state_bounds=Interval([0.0, 0], [200.0, 200]),
+        input_bounds=Interval.symmetric([2.0, 2]),
+    )
+    observer = gx.design_observer(system, NOISE, Interval(LOWER, UPPER), missing=False, sweeps=1)
+    assert observer.certificate.self_consistent
+    assert observer.certificate.implicit_rate > 0.8
+
+    rng = np.random.default_rng(0)
+    runs = 300
+    x0 = rng.uniform(LOWER + 3, UPPER - 3, (runs, 2))
+    x1 = x0 + rng.uniform(-2, 2, (runs, 2)) + rng.choice([-0.05, 0.05], (runs, 2))
+    truth = np.stack([x0, x1], 1)
+    y = np.asarray(jax.vmap(jax.vmap(lambda x: system.measurement(x, None)))(truth)) + rng.choice([-0.5, 0.5], (2, 4))
+    box = Interval(x0 - rng.uniform(0, 1, (runs, 2)) * (x0 - LOWER), x0 + rng.uniform(0, 1, (runs, 2)) * (UPPER - x0))
+    # A first measurement that says next to nothing, so that the second one meets boxes of every size.
+    v = np.array([[300.0] * 4, [0.5] * 4])
+    noise = gx.Noise(w=Interval.symmetric(np.full((2, 2), 0.05)), v=Interval.symmetric(v))
+    boxes = jax.vmap(lambda box, y: gx.estimate(observer, box, y, noise=noise).state)(box, y)
+
+    lower, upper, width = np.asarray(boxes.lower), np.asarray(boxes.upper), np.asarray(boxes.width)
+    assert (lower <= truth).all()
+    assert (truth <= upper).all()
+    within = ((lower >= LOWER) & (upper <= UPPER)).all((1, 2))
+    assert within.sum() > 200
+    assert width[within, 0].mean() > 30
+    promised = np.asarray(observer.certificate.next_width(width[within, 0], NOISE))
+    assert (width[within, 1] <= promised * 1.01).all()
+
+
+def test_a_gain_of_the_new_measurement_alone_needs_no_past():
+    """What a solver leaves of ``I - N_z C`` (1e-12) would ask for a bound of the past."""
+    system = gx.System(
+        lambda x: x, lambda x: jnp.stack([x[0] + x[1] / 3, x[1] / 3, x[0] - x[1] / 7]), G=np.eye(2), H=np.zeros((3, 2))
+    )
+    observer = gx.design_observer(system, gx.Noise(ball(0.1, 2), ball(0.2, 3)), Interval.entire(2), missing=False)
+    boxes = gx.estimate(observer, Interval.entire(2), np.zeros((2, 3)))
+    assert np.isfinite(boxes.state.width).all()
+
+
+def ball(radius: float, size: int) -> Interval:
+    return Interval.symmetric(np.full(size, radius))
