@@ -40,7 +40,7 @@ def certified(
     right: Interval,
     known: Known,
     left: Any,
-    newton: Newton,
+    newton: Newton | None,
     u: Any,
 ) -> tuple[Domain, Promised | None]:
     """Step 6 for the first gain: the right side around the centre of the old box, with the design's constant A."""

@@ -115,13 +115,16 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
     with _stage("sweeps"):
         states = maps.states(domain.box)
         covered = set(observer.first.linear) >= set(range(observer.gains.residual.shape[0]))
+        # The initial contraction was the first sweep; but the certified bound needs a solution from one of them.
+        skipped = covered and not observer.first.affine_output and not (observer.sweeps == 1 and observer.corrections)
+        newton = None
         for sweep in range(observer.sweeps):
             rows = None
             if sweep == 0 or observer.first.affine_output:
                 form = first.on(domain.box)
                 psi = Affine(form.slope - observer.C, form.center, form.radius)
-                if sweep == 0 and covered and not observer.first.affine_output:
-                    continue  # the initial contraction was this
+                if sweep == 0 and skipped:
+                    continue
             else:
                 atoms = maps.free_bounds(states, domain.box, u)
                 form = affine_rows(maps.free, states, atoms)
