@@ -72,7 +72,9 @@ class Maps:
         """Number of terms that a row can have, for rounding."""
         system = self.observer.system
         atoms = system.n + system.l if self.expansion is None else len(self.expansion.atoms)
-        return system.n + atoms + self.observer.T2.shape[0] + 4
+        window = self.observer.window
+        steps = 0 if window is None else 2 * window.length
+        return system.n + atoms + self.observer.T2.shape[0] + 4 + steps
 
     def states(self, box: Interval) -> States:
         return States.of(box, self.terms)
@@ -111,11 +113,11 @@ class Maps:
         xp = np if is_concrete(weights) else jnp
         return xp.concatenate([xp.zeros((weights.shape[0], self.observer.system.n)), weights], axis=1)
 
-    def rows(self, weights: Any) -> Rows:
-        """``weights @ [f; g]`` for weights (r, n + l), over `bounds`."""
+    def rows(self, weights: Any, minus: Any = None) -> Rows:
+        """``weights @ [f; g] - minus @ x`` for weights (r, n + l), over `bounds`."""
         if self.expansion is not None:
-            return self.expansion.rows(weights, self.dtype)
-        return self._over_arrays(weights, None)
+            return self.expansion.rows(weights, self.dtype, minus)
+        return self._over_arrays(weights, minus)
 
     @cached_property
     def free(self) -> Rows:

@@ -94,6 +94,21 @@ def row_cancellation_residual(
     return rounded_up(abs(left) + abs(exact(flat)).dot(slack)).reshape(*rows.shape[:-1], p)
 
 
+def window_residual(window: Any, plant: Any, C: Any, bounded: Any, H_slack: Any) -> tuple[np.ndarray, np.ndarray]:
+    """What the rows of a window leave of x[k], (R, n), and of the inputs of its steps, (N, R, p). Of the states in
+    between nothing is left: what multiplies them is taken from the multipliers as they are stored."""
+    n = plant.n
+    G, H, C, D, slack = (exact(m) for m in (plant.G, plant.H, C, bounded, H_slack))
+    target = exact(np.eye(n)[list(window.targets)])
+    x = target - exact(window.multipliers[0][:, :n]) - exact(window.remainder).dot(C)
+    d = []
+    for weights, known in zip(window.multipliers, window.known, strict=True):
+        of_f, of_g = exact(weights[:, :n]), exact(weights[:, n:])
+        through = of_f.dot(G) + of_g.dot(H) - exact(known).dot(D)
+        d.append(rounded_up(abs(through) + abs(of_g).dot(slack)))
+    return rounded_up(x), np.array(d).reshape(len(window.known), len(x), plant.p)
+
+
 def upper_inverse(M: np.ndarray) -> np.ndarray | None:
     """V >= 0 with ``V (I - M) >= I`` entry by entry, proved in fractions; None where ``I - M`` is no M-matrix.
 

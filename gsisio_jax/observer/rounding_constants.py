@@ -31,6 +31,7 @@ from gsisio_jax.observer.residuals import (
     rounded_up,
     row_cancellation_residual,
     upper_inverse,
+    window_residual,
 )
 from gsisio_jax.observer.types import InitialContraction, Observer, RoundingConstants, cast
 from gsisio_jax.scalar.numpy_program import numpy_function
@@ -224,6 +225,10 @@ def with_rounding_constants(
         feedthrough=_cast(H_slack, dtype),
         direct=tuple(inverses),
     )
+    window = wide.window
+    if window is not None:
+        left_x, left_d = window_residual(window, system, wide.C, wide.bounded_inputs, H_slack)
+        window = _cast_window(window, left_x, left_d, wide.T2, dtype)
     first = InitialContraction(
         form=None if system.g_takes_u else jax.tree.map(lambda x: np.asarray(x, dtype), form),
         slack=_cast(slack, dtype),
@@ -245,6 +250,7 @@ def with_rounding_constants(
         first=first,
         rounding_constants=rounding_constants,
         region_inverse=_cast(inverse, dtype),
+        window=window,
         corrections=_corrections(spectral_radius(implicit)) if certificate.promised else 0,
         certificate=certificate,
     )
@@ -264,6 +270,14 @@ def with_output(bank: LinearBounds, T2: Any) -> LinearBounds:
     dtype = bank.remainder.dtype
     products = [exact(Z).dot(exact(T2)) if Z.size else np.zeros((len(Z), T2.shape[1])) for Z in bank.remainder]
     return replace(bank, output=np.array(products, np.float64).reshape(bank.output.shape).astype(dtype))
+
+
+def _cast_window(window: Any, left_x: np.ndarray, left_d: np.ndarray, T2: np.ndarray, dtype: Any) -> Any:
+    """Multipliers as they are in that type; what they leave, rounded up; ``output = remainder T2`` rounded once."""
+    output = exact(window.remainder).dot(exact(T2)).astype(np.float64).reshape(window.output.shape)
+    stored = replace(window, output=output)
+    stored = jax.tree.map(lambda x: np.asarray(x, dtype), replace(stored, left_x=np.zeros(0), left_d=np.zeros(0)))
+    return replace(stored, left_x=_cast(left_x, dtype), left_d=_cast(left_d, dtype))
 
 
 def _R(slopes: Slopes, C: Any) -> np.ndarray:

@@ -6,6 +6,7 @@ missing. It is written over small arrays; `gsisio_jax.scalar` compiles it over s
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, choose, entire_like, nan_to_unbounded
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
-from gsisio_jax.observer import periodic
+from gsisio_jax.observer import periodic, window
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
@@ -44,7 +45,8 @@ def blank(observer: Observer, initial: Interval) -> Carry:
     values = (zero, zero) if observer.certificate.promised else (None, None)
     h = AtomBounds(jnp.zeros((atoms, n), dtype), zero, zero + jnp.inf, entire, *values)
     yes, no = jnp.asarray(True), jnp.asarray(False)
-    return Carry(initial, h, jnp.full(l, jnp.nan, dtype), jnp.zeros(m, dtype), noise, yes, no)
+    carry = Carry(initial, h, jnp.full(l, jnp.nan, dtype), jnp.zeros(m, dtype), noise, yes, no)
+    return replace(carry, older=window.before_all(carry, observer.window, observer.system.p))
 
 
 @rounding.by_observer
@@ -136,6 +138,11 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
             domain = domain.intersect(solved, Source.STATE, quiet=rows)
             states = maps.states(domain.box)
 
+    # What several steps say jointly.
+    if observer.window is not None:
+        domain = window.contract(maps, domain, carry, states, psi, y, u, noise, lost)
+        states = maps.states(domain.box)
+
     # 5. d[k-1] from every left inverse, and with it the plant's own equation; then the certified bound, where both
     # boxes lie in the region.
     with _stage("inputs"):
@@ -199,7 +206,8 @@ def _finish(
         (~(states.radius < jnp.inf).all(), Status.UNBOUNDED),
         (~applies, Status.OUTSIDE_REGION),
     )
-    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed)
+    older = window.shifted(carry, observer.window, d, conflict & fallback.conflict if hold else conflict)
+    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed, older)
     return after, StepOutput(state, d, d_now, bit_mask(bits), *domain.report())
 
 

@@ -122,6 +122,7 @@ class Observer(eqx.Module):
         bounds: the methods of Corollary 1 that bound f and g.
         sweeps: how often the box is contracted in a step.
         rounding_constants: what the gains leave by rounding.
+        window: rows over several steps (`observer.window.Window`), or None.
         corrections: Newton steps to the point that the certified bound is around (theory 5.6).
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
     """
@@ -147,6 +148,7 @@ class Observer(eqx.Module):
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     bounds: tuple[str, ...] = eqx.field(static=True)
     sweeps: int = eqx.field(static=True)
+    window: Any = None
     corrections: int = eqx.field(static=True, default=0)
     rounding: Rounding = eqx.field(static=True, default="outward")
 
@@ -227,6 +229,7 @@ class Carry(eqx.Module):
         noise: bounds of w[k] and v[k].
         starts: nothing has been measured yet.
         believed: no conflict has taken y[k] out of what is believed.
+        older: the steps before, as far as windows look back (`observer.window.Past`).
     """
 
     state: Interval
@@ -236,6 +239,7 @@ class Carry(eqx.Module):
     noise: Noise
     starts: Any
     believed: Any
+    older: Any = ()
 
 
 class StepOutput(eqx.Module):

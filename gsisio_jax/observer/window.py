@@ -1,0 +1,193 @@
+"""Rows over a window of steps: what y[k-N..k] and the boxes of x[k-N..k-1] say of x[k] jointly (theory 5.7).
+
+A row adds the plant's equations of N steps, each with a multiplier, so that inputs and the states in between cancel.
+The bounds of f and g on the boxes of these steps are kept in the carry: a window costs no new evaluation of either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.inclusion.atoms import AtomBounds, States
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, add, entire_like, is_concrete, magnitude
+from gsisio_jax.interval.image import image, loose_matvec_upper, plain_image, widened_for_sums
+from gsisio_jax.interval.primitives import matmul, scale
+from gsisio_jax.observer.contractors import Affine
+from gsisio_jax.observer.domain import Domain
+from gsisio_jax.observer.lost import Lost, plainly_wider
+from gsisio_jax.observer.measurement import everything_unless, output_box, point
+from gsisio_jax.observer.status import Source
+from gsisio_jax.plant.system import Noise
+
+
+class Window(eqx.Module):
+    """R rows for single states over the last N steps; lag t stands for step k-1-t.
+
+        x_i = sum over t of {multipliers [f + B u + w; g + D u + v - y] - (those of x) x}[k-1-t]
+              + output (y - D u - v)[k] - remainder psi(x[k]) + sum over t of known (bounded inputs)[k-1-t]
+
+    What multiplies x[k-1-t] is the part of lag t+1 that acts on f: the equation of one step less.
+
+    Attributes:
+        multipliers: (N, R, n + l).
+        output: (R, l); remainder: (R, q).
+        known: (N, R, b).
+        left_x: (R, n), what the rows leave of x[k] by rounding; left_d: (N, R, p), of the inputs.
+        targets: the state i of every row.
+    """
+
+    multipliers: Any
+    output: Any
+    remainder: Any
+    known: Any
+    left_x: Any
+    left_d: Any
+    targets: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def length(self) -> int:
+        """N, in steps."""
+        return self.multipliers.shape[0]
+
+    def states(self, lag: int, n: int) -> Any:
+        """What multiplies x[k-1-lag], (R, n)."""
+        if lag + 1 < self.length:
+            return self.multipliers[lag + 1][:, :n]
+        return np.zeros((len(self.targets), n))
+
+    def uses(self, lag: int) -> Any:
+        """Which rows look at that step or one before it, (R,)."""
+        return (self.multipliers[lag:] != 0).any((0, -1))
+
+
+class Past(eqx.Module):
+    """A step before the last one, as windows need it.
+
+    Attributes:
+        state: box of x, (n,).
+        h: bounds of f and g on it.
+        y, u, noise: of that step.
+        input: upper bound (p,) of |d| then.
+        believed: its measurement was.
+        trusted: no conflict since has thrown away what was known then.
+    """
+
+    state: Interval
+    h: AtomBounds
+    y: Any
+    u: Any
+    noise: Noise
+    input: Any
+    believed: Any
+    trusted: Any
+
+
+def before_all(carry: Any, window: Window | None, p: int) -> tuple[Past, ...]:
+    """What a first step has of a past: nothing that counts."""
+    if window is None:
+        return ()
+    dtype = carry.y.dtype
+    empty = Past(
+        entire_like(carry.state), _kept(carry.h), carry.y, carry.u, carry.noise, jnp.full(p, jnp.inf, dtype),
+        jnp.asarray(False), jnp.asarray(False),
+    )  # fmt: skip
+    return (empty,) * (window.length - 1)
+
+
+def shifted(carry: Any, window: Window | None, d: Interval, dropped: Any) -> tuple[Past, ...]:
+    """The past of the next step: the step before this one goes in front, unless a conflict has dropped all of it."""
+    if window is None:
+        return ()
+    found = (_last(carry, magnitude(d)), *carry.older)[: window.length - 1]
+    return tuple(replace(past, trusted=past.trusted & ~dropped) for past in found)
+
+
+def _last(carry: Any, d: Any) -> Past:
+    return Past(carry.state, _kept(carry.h), carry.y, carry.u, carry.noise, d, carry.believed, ~carry.starts)
+
+
+def _kept(h: AtomBounds) -> AtomBounds:
+    """Values at the center serve the certificate alone, which looks back one step."""
+    return replace(h, value=None, value_error=None)
+
+
+@jax.named_scope("window")
+def contract(
+    maps: Any, domain: Domain, carry: Any, states: States, psi: Affine, y: Any, u: Any, noise: Noise, lost: Lost
+) -> Domain:
+    """Contract the box of x[k] with every row.
+
+    Args:
+        maps: of the observer.
+        domain: of x[k] so far.
+        carry: the step before, and older ones.
+        states: the box of x[k] so far.
+        psi: affine bounds of psi on a box that holds it.
+        y, u, noise: of step k.
+        lost: bounds the inputs of the last step.
+    """
+    window, system = maps.observer.window, maps.observer.system
+    n, dtype = system.n, y.dtype
+    pasts = (_last(carry, lost.magnitudes(domain.box)[1]), *carry.older)
+    weights, boxes = [window.output], [output_box(system, y, u, noise.v)]
+    lower = upper = jnp.zeros(len(window.targets), dtype)
+    holds = jnp.ones(len(window.targets), bool)
+    bounded = image(maps.observer.bounded_inputs, system.input_bounds)
+    for lag, past in enumerate(pasts):
+        multipliers = window.multipliers[lag]
+        used = _any(multipliers, window.states(lag, n))
+        if used is False:
+            continue
+        rows = maps.rows(multipliers, window.states(lag, n))
+        found = rows.joint_box(maps.states(past.state), past.h)
+        lower, upper = lower + jnp.where(used, found.lower, 0), upper + jnp.where(used, found.upper, 0)
+        measured = (multipliers[:, n:] != 0).any(-1)
+        holds = holds & (~used | past.trusted) & (~measured | past.believed)
+        weights += [multipliers, window.known[lag]]
+        boxes += [_shift(system, past), bounded]
+    joined = Interval.unchecked(*(jnp.concatenate([getattr(b, s) for b in boxes]) for s in ("lower", "upper")))
+    weights = jnp.concatenate([jnp.asarray(w, dtype) for w in weights], -1)
+    linear = plain_image(weights, widened_for_sums(joined, weights.shape[-1] + 2 * window.length + 4))
+    # The part of x[k] itself, psi, on the box so far.
+    slope = matmul(window.remainder, psi.slope)
+    middle = matmul(slope, states.center) + matmul(window.remainder, psi.center)
+    loose = scale(abs(slope), states.radius).sum(-1) + scale(abs(window.remainder), psi.radius).sum(-1)
+    # Slopes that were combined are off by what they are made of.
+    loose = loose + scale(abs(window.remainder), scale(abs(psi.slope), states.error).sum(-1)).sum(-1)
+    box = Interval.unchecked(linear.lower + lower - (middle + loose), linear.upper + upper - (middle - loose))
+    if rounding.outward():
+        left = jnp.concatenate([window.left_x, *window.left_d], -1)
+        sizes = jnp.concatenate([magnitude(domain.box), *(past.input for past in pasts)])
+        box = plainly_wider(box, loose_matvec_upper(left, sizes))
+    return domain.intersect(_by_state(everything_unless(holds, box), window.targets, n), Source.STATE)
+
+
+def _any(multipliers: Any, states: Any) -> Any:
+    """Which rows look at a step, (R,); False where it is known that none does."""
+    used = (multipliers != 0).any(-1) | (states != 0).any(-1)
+    return False if is_concrete(used) and not np.asarray(used).any() else used
+
+
+def _shift(system: Any, past: Past) -> Interval:
+    """[B u + w; D u + v - y] of a step."""
+    drift = add(image(system.B, point(past.u)), past.noise.w) if system.m else past.noise.w
+    seen = output_box(system, past.y, past.u, past.noise.v)
+    return Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
+
+
+def _by_state(box: Interval, targets: tuple[int, ...], n: int) -> Interval:
+    """Rows as boxes of all states, (K, n): a state with fewer rows repeats its last one, one without has no bound."""
+    rows = [[r for r, i in enumerate(targets) if i == state] for state in range(n)]
+    lower, upper = [], []
+    for k in range(max(map(len, rows))):
+        for side, out, none in ((box.lower, lower, -jnp.inf), (box.upper, upper, jnp.inf)):
+            entries = [side[of[min(k, len(of) - 1)]] if of else jnp.asarray(none, side.dtype) for of in rows]
+            out.append(jnp.stack(entries))
+    return Interval.unchecked(jnp.stack(lower), jnp.stack(upper))
