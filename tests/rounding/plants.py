@@ -114,7 +114,7 @@ def linear_observer(name: str, dtype: Any) -> gx.Observer:
     n, l = len(A), len(C)
     noise = gx.Noise(Interval.symmetric(np.full(n, 1e-9)), Interval.symmetric(np.full(l, 1e-9)))
     region = Interval.symmetric(np.full(n, 4.0)) if plant.squares else Interval.entire(n)
-    return gx.design_observer(gx.System(f, g, G=plant.G, H=plant.H), noise, region, missing=False, gains=2)
+    return gx.design_observer(gx.System(f, g, G=plant.G, H=plant.H), noise, region, missing=False, gains=2, window=3)
 
 
 @lru_cache
@@ -130,11 +130,11 @@ def nonlinear_observer(name: str) -> gx.Observer:
     if name == "waves":
         system = gx.System(lambda x: f(x, []), g, G=plant.G, H=plant.H)
         noise = gx.Noise(Interval.symmetric(np.full(2, 0.01)), Interval.symmetric(np.full(2, 0.01)))
-        return gx.design_observer(system, noise, Interval.symmetric([1.0, 1.5]), missing=False, gains=2)
+        return gx.design_observer(system, noise, Interval.symmetric([1.0, 1.5]), missing=False, gains=2, window=3)
     full = Interval(np.zeros(6), np.full(6, np.inf))
     system = gx.System(f, g, G=plant.G, H=plant.H, m=2, state_bounds=full)
     noise = gx.Noise(Interval.symmetric(np.full(6, 1e-3)), Interval.symmetric(np.full(3, 0.2)))
     region = Interval(np.full(6, 4.0), np.full(6, 26.0))
     return gx.design_observer(
-        system, noise, region, u_region=Interval([0.0, 0.125], [0.2, 0.125]), missing=False, gains=2
+        system, noise, region, u_region=Interval([0.0, 0.125], [0.2, 0.125]), missing=False, gains=2, window=3
     )
