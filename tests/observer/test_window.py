@@ -31,7 +31,7 @@ def record(seed, steps=30, jump=None):
     x, states, seen = rng.uniform(-START, START), [], []
     for k in range(steps):
         if k == jump:
-            x = x + [4.0, -3.0]
+            x = x + np.array([4.0, -3.0])
         states.append(x)
         seen.append(x + rng.uniform(-V, V))
         x = TURN @ x + rng.uniform(-W, W)
@@ -66,7 +66,7 @@ def test_a_conflict_throws_away_what_it_contradicts(on_conflict):
     for seed in range(4):
         x, y = record(seed, jump=12 if on_conflict == "restart" else None)
         if on_conflict == "hold":
-            y[12, 0] += 5
+            y[12] += [5, 8]
         est = run(rotation(4), y, on_conflict=on_conflict)
         status = np.asarray(est.status)
         assert status[12] & gx.Status.CONFLICT
