@@ -1,4 +1,4 @@
-"""The exact hull of the last state of a record of a linear plant without unknown input: two linear programs a state."""
+"""The exact hull of the last state of a record of a linear plant: two linear programs a state."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from scipy import sparse
 from scipy.optimize import linprog
 
 
-def exact_hull(A: Any, C: Any, w: Any, v: Any, start: Any, y: Any) -> np.ndarray:
-    """Widths (n,) for ``x+ = A x + w, y = C x + v, |w|, |v|, |x0|`` bounded.
+def exact_hull(A: Any, C: Any, w: Any, v: Any, start: Any, y: Any, G: Any = None, H: Any = None) -> np.ndarray:
+    """Widths (n,) for ``x+ = A x + G d + w, y = C x + H d + v``; w, v and x0 are bounded, nothing is known of d.
 
     Args:
         A, C: (n, n) and (l, n).
-        w, v, start: bounds (n,), (l,) and (n,).
+        w, v, start: bounds of magnitudes, (n,), (l,) and (n,).
         y: (T, l).
+        G, H: (n, p) and (l, p); None without an unknown input.
     """
     steps, n = len(y), len(A)
+    G, H = (np.zeros((len(M), 0)) if N is None else N for M, N in ((A, G), (C, H)))
     before, after = sparse.eye_array(steps - 1, steps), sparse.eye_array(steps - 1, steps, k=1)
-    moves = sparse.kron(after, np.eye(n)) - sparse.kron(before, A)
-    sees = sparse.kron(sparse.eye_array(steps), C)
-    begins = sparse.eye_array(n, steps * n)
+    moves = sparse.hstack([sparse.kron(after, np.eye(n)) - sparse.kron(before, A), -sparse.kron(before, G)])
+    sees = sparse.hstack([sparse.kron(sparse.eye_array(steps), C), sparse.kron(sparse.eye_array(steps), H)])
+    begins = sparse.eye_array(n, moves.shape[1])
     rows = sparse.vstack([moves, sees, begins])
     center = np.concatenate([np.zeros((steps - 1) * n), np.ravel(y), np.zeros(n)])
     radius = np.concatenate([np.tile(w, steps - 1), np.tile(v, steps), start])
     limits = np.concatenate([center + radius, radius - center])
+    both = sparse.csr_array(sparse.vstack([rows, -rows]))
     width = []
     for i in range(n):
-        cost = np.zeros(steps * n)
+        cost = np.zeros(moves.shape[1])
         cost[(steps - 1) * n + i] = 1
-        low, high = (
-            linprog(sign * cost, sparse.csr_array(sparse.vstack([rows, -rows])), limits, bounds=(None, None)).fun * sign
-            for sign in (1, -1)
-        )
+        low, high = (linprog(sign * cost, both, limits, bounds=(None, None)).fun * sign for sign in (1, -1))
         width.append(high - low)
     return np.array(width)

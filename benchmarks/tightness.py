@@ -1,0 +1,185 @@
+"""`python -m benchmarks.tightness`: widths over those of the exact hull, by window, for linear plants that are hard.
+
+The exact hull of x[k] takes all measurements so far into account (two linear programs a state). Widths are means over
+the last fifteen of thirty steps and over records: noise uniform and d white, then noise near its vertices (99 %, or the
+hull may be a point) and d slow.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.linalg import expm
+
+from benchmarks.__main__ import RESULTS, setting
+from benchmarks.plants import TESTS
+
+STEPS, FROM = 30, 15
+
+
+@dataclass(frozen=True)
+class Plant:
+    """``x+ = A x + G d + w, y = C x + H d + v`` and the magnitudes of w, v and x0."""
+
+    A: np.ndarray
+    C: np.ndarray
+    G: np.ndarray
+    H: np.ndarray
+    w: np.ndarray
+    v: np.ndarray
+    start: np.ndarray
+
+    def record(self, seed: int, hard: bool) -> tuple[np.ndarray, np.ndarray]:
+        """States (T, n) and measurements (T, l)."""
+        rng = np.random.default_rng(seed)
+        d = 3.0 * rng.standard_normal((STEPS, self.G.shape[1]))
+        d = np.cumsum(0.05 * d, 0) if hard else d
+
+        def draw(radius: np.ndarray) -> np.ndarray:
+            return 0.99 * radius * rng.choice([-1.0, 1.0], len(radius)) if hard else rng.uniform(-radius, radius)
+
+        x, states, seen = draw(self.start), [], []
+        for k in range(STEPS):
+            states.append(x)
+            seen.append(self.C @ x + self.H @ d[k] + draw(self.v))
+            x = self.A @ x + self.G @ d[k] + draw(self.w)
+        return np.array(states), np.array(seen)
+
+
+def rotation() -> Plant:
+    """A slow turn, one of whose two states is measured forty times worse than the other."""
+    c, s = 0.95 * np.cos(0.3), 0.95 * np.sin(0.3)
+    none = np.zeros((2, 0))
+    return Plant(
+        np.array([[c, -s], [s, c]]), np.eye(2), none, none, np.full(2, 0.02), np.array([0.05, 2]), np.full(2, 3.0)
+    )
+
+
+def chain() -> Plant:
+    """Three masses in a row between springs, sampled at .2 s; a force on the middle one, a fault of a second sensor."""
+    stiffness = 3.0 * np.array([[-2, 1, 0], [1, -2, 1], [0, 1, -2]])
+    continuous = np.zeros((7, 7))
+    continuous[:3, 3:6], continuous[3:6, :3], continuous[3:6, 3:6] = np.eye(3), stiffness, -0.3 * np.eye(3)
+    continuous[4, 6] = 1
+    moved = expm(0.2 * continuous)
+    C = np.eye(6)[[0, 1, 2, 4, 0]]
+    G = np.column_stack([moved[:6, 6], np.zeros(6)])
+    H = np.zeros((5, 2))
+    H[4, 1] = 1
+    return Plant(moved[:6, :6], C, G, H, np.full(6, 0.01), np.full(5, 0.1), np.full(6, 2.0))
+
+
+def network() -> Plant:
+    """Eight states that act on some of the others, six outputs, three unknown inputs."""
+    rng = np.random.default_rng(8)
+    A = rng.normal(size=(8, 8)) * (rng.random((8, 8)) < 0.4)
+    A *= 0.9 / np.abs(np.linalg.eigvals(A)).max()
+    C = np.eye(8)[[0, 1, 3, 4, 6, 7]] + 0.3 * rng.normal(size=(6, 8)) * (rng.random((6, 8)) < 0.2)
+    G, H = np.zeros((8, 3)), np.zeros((6, 3))
+    G[[0, 4, 3], [0, 1, 1]] = 1, 0.5, -0.4
+    H[[2, 5], [1, 2]] = 0.7, 1
+    return Plant(A, C, G, H, np.full(8, 0.02), np.full(6, 0.1), np.full(8, 2.0))
+
+
+def full_rank() -> Plant:
+    """Three states, five outputs, an input in each of the first three."""
+    A = np.array([[0.8, 0.2, 0], [-0.1, 0.9, 0.3], [0.05, -0.2, 0.7]])
+    C = np.vstack([np.eye(3), [[1, 1, 0], [0, 1, -1]]])
+    G = np.array([[0.5, 0, 1], [0, 1, 0], [0, 0, 0.4]])
+    return Plant(A, C, G, np.eye(5, 3), np.full(3, 0.02), np.full(5, 0.1), np.full(3, 2.0))
+
+
+PLANTS: dict[str, Callable[[], Plant]] = {
+    "rotation": rotation, "chain": chain, "network": network, "full_rank": full_rank,
+}  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.tightness", description=__doc__)
+    parser.add_argument("--windows", type=int, nargs="+", default=[1, 2, 3, 5])
+    parser.add_argument("--records", type=int, default=3)
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+    sys.path.insert(0, str(TESTS))
+    table = {}
+    for name, make in PLANTS.items():
+        if options.only in name:
+            table[name] = measured(make(), options.windows, options.records)
+            print(name)
+            for window, row in table[name].items():
+                print(f"  window {window}: " + ", ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+    (RESULTS / "tightness.json").write_text(json.dumps({"setting": setting(), "table": table}, indent=1) + "\n")
+    return 0
+
+
+def measured(plant: Plant, windows: list[int], records: int) -> dict[int, dict[str, Any]]:
+    """Ratios of widths, rows of the window, seconds to design, microseconds a step and box, for every window."""
+    from oracles.record_hull import exact_hull
+
+    import gsisio_jax as gx
+
+    ball = gx.Interval.symmetric
+    system = gx.System(lambda x: plant.A @ x, lambda x: plant.C @ x, G=plant.G, H=plant.H)
+    noise = gx.Noise(ball(plant.w), ball(plant.v))
+    region = gx.Interval.entire(len(plant.A))
+    runs = {hard: [plant.record(seed, hard) for seed in range(records)] for hard in (False, True)}
+    hulls = {
+        hard: np.array(
+            [
+                [
+                    exact_hull(plant.A, plant.C, plant.w, plant.v, plant.start, y[: k + 1], plant.G, plant.H)
+                    for k in range(FROM, STEPS, 7)
+                ]
+                for _, y in runs[hard]
+            ]
+        )
+        for hard in runs
+    }
+    found = {}
+    for window in windows:
+        began = time.perf_counter()
+        observer = gx.design_observer(system, noise, region, missing=False, window=window)
+        design = time.perf_counter() - began
+        row: dict[str, Any] = {}
+        for hard, label in ((False, "uniform"), (True, "vertices")):
+            y = np.array([y for _, y in runs[hard]])
+            boxes = jax.vmap(lambda y, o=observer: gx.estimate(o, ball(plant.start), y).state)(y)
+            x = np.array([x for x, _ in runs[hard]])
+            assert ((boxes.lower <= x) & (x <= boxes.upper)).all(), "a box misses the truth"
+            width = np.asarray(boxes.width)[:, FROM:STEPS:7]
+            ratio = width.mean((0, 1)) / hulls[hard].mean((0, 1))
+            row[label] = [round(float(value), 3) for value in ratio]
+        row["rows"] = 0 if observer.window is None else len(observer.window.targets)
+        row["design_s"] = round(design, 2)
+        row["us"] = _step_time(observer, plant)
+        found[window] = row
+    return found
+
+
+def _step_time(observer: Any, plant: Plant, boxes: int = 2_000) -> float:
+    """Microseconds a step and box, of a batch that shares a record."""
+    import gsisio_jax as gx
+
+    _, y = plant.record(0, False)
+    start = gx.Interval(np.tile(-plant.start, (boxes, 1)), np.tile(plant.start, (boxes, 1)))
+    run = jax.jit(jax.vmap(lambda box: gx.estimate(observer, box, y).state.width[-1]))
+    jax.block_until_ready(run(start))
+    times = []
+    for _ in range(3):
+        began = time.perf_counter()
+        jax.block_until_ready(run(start))
+        times.append(time.perf_counter() - began)
+    return round(min(times) / boxes / STEPS * 1e6, 3)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    sys.exit(main())
