@@ -297,6 +297,10 @@ def _as_window(problem: GainProblem, length: int, rows: Rows, kept: list[int], x
     of_g = own[None] * of_g.reshape(R, N, l).transpose(1, 0, 2)[::-1] / y
     multipliers = np.concatenate([of_f, -of_g], axis=2)
     remainder = own * remainder / z
+    # Rows that look back farthest come first, so that those of a lag are the first ones.
+    depth = np.array([max(np.flatnonzero((multipliers[:, r] != 0).any(-1)), default=-1) + 1 for r in range(R)])
+    order = np.argsort(-depth, kind="stable")
+    multipliers, remainder = multipliers[:, order], remainder[order]
     stacked = np.vstack([problem.G, problem.H])
     return Window(
         multipliers=multipliers,
@@ -305,5 +309,6 @@ def _as_window(problem: GainProblem, length: int, rows: Rows, kept: list[int], x
         known=(multipliers @ stacked)[:, :, ~problem.free],
         left_x=np.zeros((R, n)),
         left_d=np.zeros((N, R, stacked.shape[1])),
-        targets=tuple(targets),
+        targets=tuple(targets[r] for r in order),
+        counts=tuple(int((depth > lag).sum()) for lag in range(N)),
     )

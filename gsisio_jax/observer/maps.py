@@ -73,7 +73,7 @@ class Maps:
         system = self.observer.system
         atoms = system.n + system.l if self.expansion is None else len(self.expansion.atoms)
         window = self.observer.window
-        steps = 0 if window is None else 2 * window.length
+        steps = 0 if window is None else window.terms
         return system.n + atoms + self.observer.T2.shape[0] + 4 + steps
 
     def states(self, box: Interval) -> States:

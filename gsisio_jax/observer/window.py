@@ -16,7 +16,7 @@ import numpy as np
 
 from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, add, entire_like, is_concrete, magnitude
+from gsisio_jax.interval.box import Interval, add, entire_like, magnitude
 from gsisio_jax.interval.image import image, loose_matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.contractors import Affine
@@ -41,6 +41,7 @@ class Window(eqx.Module):
         known: (N, R, b).
         left_x: (R, n), what the rows leave of x[k] by rounding; left_d: (N, R, p), of the inputs.
         targets: the state i of every row.
+        counts: how many rows, the first ones, look back to lag 0, 1, ...
     """
 
     multipliers: Any
@@ -50,6 +51,7 @@ class Window(eqx.Module):
     left_x: Any
     left_d: Any
     targets: tuple[int, ...] = eqx.field(static=True)
+    counts: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def length(self) -> int:
@@ -62,9 +64,10 @@ class Window(eqx.Module):
             return self.multipliers[lag + 1][:, :n]
         return np.zeros((len(self.targets), n))
 
-    def uses(self, lag: int) -> Any:
-        """Which rows look at that step or one before it, (R,)."""
-        return (self.multipliers[lag:] != 0).any((0, -1))
+    @property
+    def terms(self) -> int:
+        """What is added up of all lags, for rounding."""
+        return 2 * self.length + 4
 
 
 class Past(eqx.Module):
@@ -134,34 +137,28 @@ def contract(
         lost: bounds the inputs of the last step.
     """
     window, system = maps.observer.window, maps.observer.system
-    n, dtype = system.n, y.dtype
+    n, _dtype = system.n, y.dtype
     pasts = (_last(carry, lost.magnitudes(domain.box)[1]), *carry.older)
-    weights, boxes = [window.output], [output_box(system, y, u, noise.v)]
-    lower = upper = jnp.zeros(len(window.targets), dtype)
+    total = plain_image(window.output, widened_for_sums(output_box(system, y, u, noise.v), system.l + window.terms))
     holds = jnp.ones(len(window.targets), bool)
-    bounded = image(maps.observer.bounded_inputs, system.input_bounds)
-    for lag, past in enumerate(pasts):
-        multipliers = window.multipliers[lag]
-        used = _any(multipliers, window.states(lag, n))
-        if used is False:
-            continue
-        rows = maps.rows(multipliers, window.states(lag, n))
+    for lag, (past, count) in enumerate(zip(pasts, window.counts, strict=True)):
+        multipliers = window.multipliers[lag][:count]
+        # f and g jointly on the box of that step, slopes combined first; then what is known of it.
+        rows = maps.rows(multipliers, window.states(lag, n)[:count])
         found = rows.joint_box(maps.states(past.state), past.h)
-        lower, upper = lower + jnp.where(used, found.lower, 0), upper + jnp.where(used, found.upper, 0)
+        weights = jnp.concatenate([multipliers, window.known[lag][:count]], -1)
+        known = plain_image(weights, _known(maps.observer, past, weights.shape[-1] + window.terms))
+        part = Interval.unchecked(found.lower + known.lower, found.upper + known.upper)
+        total = Interval.unchecked(_added(total.lower, part.lower), _added(total.upper, part.upper))
         measured = (multipliers[:, n:] != 0).any(-1)
-        holds = holds & (~used | past.trusted) & (~measured | past.believed)
-        weights += [multipliers, window.known[lag]]
-        boxes += [_shift(system, past), bounded]
-    joined = Interval.unchecked(*(jnp.concatenate([getattr(b, s) for b in boxes]) for s in ("lower", "upper")))
-    weights = jnp.concatenate([jnp.asarray(w, dtype) for w in weights], -1)
-    linear = plain_image(weights, widened_for_sums(joined, weights.shape[-1] + 2 * window.length + 4))
+        holds = jnp.concatenate([holds[:count] & past.trusted & (~measured | past.believed), holds[count:]])
     # The part of x[k] itself, psi, on the box so far.
     slope = matmul(window.remainder, psi.slope)
     middle = matmul(slope, states.center) + matmul(window.remainder, psi.center)
     loose = scale(abs(slope), states.radius).sum(-1) + scale(abs(window.remainder), psi.radius).sum(-1)
     # Slopes that were combined are off by what they are made of.
     loose = loose + scale(abs(window.remainder), scale(abs(psi.slope), states.error).sum(-1)).sum(-1)
-    box = Interval.unchecked(linear.lower + lower - (middle + loose), linear.upper + upper - (middle - loose))
+    box = Interval.unchecked(total.lower - (middle + loose), total.upper - (middle - loose))
     if rounding.outward():
         left = jnp.concatenate([window.left_x, *window.left_d], -1)
         sizes = jnp.concatenate([magnitude(domain.box), *(past.input for past in pasts)])
@@ -169,17 +166,23 @@ def contract(
     return domain.intersect(_by_state(everything_unless(holds, box), window.targets, n), Source.STATE)
 
 
-def _any(multipliers: Any, states: Any) -> Any:
-    """Which rows look at a step, (R,); False where it is known that none does."""
-    used = (multipliers != 0).any(-1) | (states != 0).any(-1)
-    return False if is_concrete(used) and not np.asarray(used).any() else used
-
-
-def _shift(system: Any, past: Past) -> Interval:
-    """[B u + w; D u + v - y] of a step."""
+def _known(observer: Any, past: Past, terms: int) -> Interval:
+    """[B u + w; D u + v - y] of a step, and the bounds of inputs that have them, widened for sums."""
+    system = observer.system
     drift = add(image(system.B, point(past.u)), past.noise.w) if system.m else past.noise.w
-    seen = output_box(system, past.y, past.u, past.noise.v)
-    return Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
+    seen, bounded = (
+        output_box(system, past.y, past.u, past.noise.v),
+        image(observer.bounded_inputs, system.input_bounds),
+    )
+    lower = jnp.concatenate([drift.lower, -seen.upper, bounded.lower])
+    return widened_for_sums(
+        Interval.unchecked(lower, jnp.concatenate([drift.upper, -seen.lower, bounded.upper])), terms
+    )
+
+
+def _added(total: Any, part: Any) -> Any:
+    """The part added to as many rows as it has."""
+    return jnp.concatenate([total[: part.shape[0]] + part, total[part.shape[0] :]])
 
 
 def _by_state(box: Interval, targets: tuple[int, ...], n: int) -> Interval:
