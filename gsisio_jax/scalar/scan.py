@@ -17,9 +17,9 @@ from gsisio_jax.scalar.unroll import numbers_in
 MOST_NUMBERS = 100_000
 """Numbers that a body may compute, arrays unrolled. Beyond, compiling takes longer than running wins back.
 
-Measured over single numbers and over arrays (two cores shared with other work, linear plants, batch of 2,000): at 74,000
-a first call of 17 and 10 s, .62 and 6.8 microseconds a step and box; at 88,000 23 and 10 s, .76 and 8.7; at 136,000 39 and
-9 s, 2.1 and 11.5."""
+Measured over single numbers and over arrays (two cores shared with other work, linear plants, batch of 2,000): at
+74,000 a first call of 17 and 10 s, .62 and 6.8 microseconds a step and box; at 88,000 23 and 10 s, .76 and 8.7; at
+136,000 39 and 9 s, 2.1 and 11.5."""
 
 
 def scan(
