@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from checks import Tally, check, check_forms
 from oracles.exact_sums import product, sign
-from oracles.real_library import FUNCTIONS
+from oracles.real_all import FUNCTIONS
 from plants import LINEAR, NONLINEAR, QUADRATIC
 from runs import Runs, estimator, run
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from checks import Tally, bounds_of, check, check_forms, compare
 from flint import arb, ctx
-from oracles.real_library import FUNCTIONS
+from oracles.real_all import FUNCTIONS
 from sampling import boxes, points
 
 NAMES = list(FUNCTIONS)

@@ -24,7 +24,7 @@ from gsisio_jax.inclusion.rules import activations, solving, vectors
 from gsisio_jax.inclusion.rules.comparison import select, step
 from gsisio_jax.inclusion.rules.functions import CURVES
 from gsisio_jax.inclusion.rules.gates import GATES
-from gsisio_jax.inclusion.rules.linear import add, move, multiple, negative
+from gsisio_jax.inclusion.rules.linear import add, move, multiple, negative, subtract, total
 from gsisio_jax.inclusion.rules.order import count_below
 from gsisio_jax.inclusion.rules.tables import PiecewiseLinear, interpolation
 from gsisio_jax.inclusion.rules.univariate import apply
@@ -174,6 +174,34 @@ def _logit(eqn: Any, x: Node) -> list[Any]:
     return [multiple(2.0, apply(CURVES["atanh"], normalised(moved)))]
 
 
+def _celu(eqn: Any, x: Any, *others: Any) -> list[Any] | None:
+    """With the scale that is its second argument, or in its body."""
+    if not _concrete(*others) or len(others) > 1:
+        return None
+    alpha, sample = float(np.asarray(others[0]) if others else 1.0), _sample(eqn)
+    if np.ndim(others[0] if others else 1.0) or not alpha > 0:
+        return None
+    exact = np.maximum(sample, 0) + alpha * np.expm1(np.minimum(sample, 0) / alpha)
+    return [apply(activations.celu(alpha), x)] if _agree(eqn, _body_at(eqn, sample, *others)[0], exact) else None
+
+
+def _std(eqn: Any, x: Any, *others: Any) -> list[Any] | None:
+    """The standard deviation of all entries: the norm of their differences from the mean, which has no kink but 0."""
+    sample = _sample(eqn)
+    count = sample.size
+    if not _concrete(*others) or not 1 < count <= 64:
+        return None
+    (found,) = _body_at(eqn, sample, *others)
+    for less in (0, 1):
+        if _agree(eqn, found, np.std(sample, ddof=less)):
+            flat = move(lambda v: v.reshape(-1), x)
+            middle = multiple(np.asarray(1 / count, x.dtype), total(flat, [0]), rounded=True)
+            away = subtract(flat, move(lambda v: jnp.broadcast_to(v, (count,)), middle))
+            size = vectors.norm(normalised(away))
+            return [multiple(np.asarray((count - less) ** -0.5, x.dtype), size, rounded=True)]
+    return None
+
+
 WHOLE: dict[str, Rule] = {
     "_interp": _interp,
     "searchsorted": _searchsorted,
@@ -187,7 +215,12 @@ WHOLE: dict[str, Rule] = {
     "mish": _one_of(GATES["mish"]),
     "soft_sign": _one_of((activations.SOFT_SIGN, lambda t: t / (1 + np.abs(t)))),
     "sinc": _one_of((activations.SINC, np.sinc)),
+    "celu": _celu,
+    "_std": _std,
+    "_xlogx": lambda eqn, x: [apply(activations.X_LOG_X, x)],
 }
+# Of these the result is not rounded.
+EXACT = {"searchsorted", "copysign"}
 
 
 # Systems --------------------------------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from gsisio_jax.inclusion.rules import (
     indexing,
     library,
     linear,
+    log_sums,
     order,
     powers,
     scattering,
@@ -308,7 +309,8 @@ MOVES |= {
 # Functions of JAX's own libraries whose body loses what the function as a whole keeps. Matched by name, and only where
 # the body comes from JAX itself.
 LIBRARY: dict[str, Rule] = {
-    "logaddexp": _plain(comparison.log_add_exp),
+    "logaddexp": _plain(log_sums.log_add_exp),
+    "logaddexp2": _plain(log_sums.log_add_exp2),
     "remainder": _plain(comparison.floored_remainder),
     "floor_divide": lambda eqn, x, y: comparison.staircase(jnp.floor, -1.0, 0.0)(bilinear.divide(x, y)),
     "trunc": _plain(comparison.truncate),

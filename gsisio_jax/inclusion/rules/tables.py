@@ -180,8 +180,12 @@ class PiecewiseLinear:
         s = jnp.where(both, s, jnp.where(low, self.tails[1], self.tails[0])).astype(a.dtype)
         usable = jnp.isfinite(s) & (low | high | (self.tails[0] == self.tails[1]))
         s = jnp.where(usable, s, 0)
-        # An infinite end adds nothing that the last knot has not: there the rest does not change any more.
-        far = (jnp.where(low, a, jnp.minimum(self.knots[0], b)), jnp.where(high, b, jnp.maximum(self.knots[-1], a)))
+        # An infinite end adds nothing that the last knot has not, or a point beyond it where the function jumps there:
+        # further out the rest does not change any more.
+        first, last = (
+            knot + side * jump for knot, side, jump in zip(self.knots[[0, -1]], (-1, 1), self.jumps, strict=True)
+        )
+        far = (jnp.where(low, a, jnp.minimum(first, b)), jnp.where(high, b, jnp.maximum(last, a)))
         rest = self._extremes(*far, s)
         for end, k in ((low, 0), (high, 1)):
             # The tail's slope is that of a segment, to within its rounding: times infinity, that is no bound.
