@@ -248,7 +248,7 @@ def linear_system(eqn: Any, *args: Any) -> list[Any]:
             if vector.shape[int(turned)] != n:
                 continue
             if _agree(eqn, found, (m @ vector.T).T if turned else m @ vector):
-                a = move(lambda v, transposed=transposed: v.T if transposed else v, a)
+                a = move(lambda v: v.T, a) if transposed else a
                 b = move(lambda v: v.T, b) if turned else b
                 x = solving.solve(a, b)
                 return [move(lambda v: v.T, x) if turned else x]

@@ -31,6 +31,7 @@ from gsisio_jax.inclusion.rules.bilinear import divide, multiply
 from gsisio_jax.inclusion.rules.functions import CURVES, SQUARE
 from gsisio_jax.inclusion.rules.linear import add, move, multiple, structural, subtract, total
 from gsisio_jax.inclusion.rules.possible import formless, unknown
+from gsisio_jax.inclusion.rules.tangents import Tangents
 from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, magnitude
@@ -45,11 +46,10 @@ def solve(a: Any, b: Any) -> Any:
         if is_known(a):
             return _solve_known(a, b)
         a = as_node(a, np.shape(a), b.dtype)
-    a = normalised(a)
     columns = len(_shape(b)) == 2
-    b = normalised(b) if is_node(b) else as_node(b, np.shape(b), a.dtype)
-    b = b if columns else move(lambda v: v[:, None], b)
-    x = _solve_columns(a, b)
+    b = b if is_node(b) else as_node(b, np.shape(b), a.dtype)
+    right = b if columns else move(lambda v: v[:, None], b)
+    x = _solve_columns(normalised(a), normalised(right), (a, b))
     return x if columns else move(lambda v: v[:, 0], x)
 
 
@@ -74,26 +74,31 @@ def _image(a: Interval, b: Interval) -> Interval:
     return Interval.unchecked(rounding.sum_down(terms.lower, -2), rounding.sum_up(terms.upper, -2))
 
 
-def _solve_columns(a: Node, b: Node) -> Node:
-    n = a.shape[0]
+def _solve_columns(a: Node, b: Node, sources: tuple[Node, Node]) -> Node:
+    """`sources` are a and b as they came, with their origins."""
     c = _inverse(a.range.center)
-    x = _clean(c @ _clean(b.range.center))
+    _, jac = parts([a, b])
     # E = I - C A; the bounds of its entries are all that is used of it.
-    eye = np.eye(n, dtype=a.dtype)
-    error = normalised(subtract(eye, _times(c, formless(a)))).range
-    small = magnitude(error)
-    residual = subtract(b, _times(a, x))
-    start = normalised(_times(c, formless(residual)))
-    reached = magnitude(start.range)
-    u, proved = _fixed_radius(small, reached)
-    spread = Interval.unchecked(-u, u)
-    left = _image(error, spread)
-    y = box_sum(start.range, left)
+    error = normalised(subtract(np.eye(a.shape[0], dtype=a.dtype), _times(c, formless(a)))).range
+    if jac is None:
+        return _enclosed(a, b, c, error)
+    # The inverse is the solution for the unit vectors.
+    m, eye = b.shape[1], as_node(np.eye(a.shape[0]), a.shape, a.dtype)
+    right = structural(lambda *v: jnp.concatenate(v, 1), [formless(b), eye])[0]
+    every = _enclosed(formless(a), right, c, error)
+    x, inverse = (move(lambda v, part=part: v[:, part], every) for part in (slice(None, m), slice(m, None)))
+    return Node(x.range, x.form, _derivative(*sources, normalised(x), normalised(inverse)))
+
+
+def _enclosed(a: Node, b: Node, c: Any, error: Interval) -> Node:
+    """The solution with its form, without a Jacobian; see the module docstring."""
+    x = _clean(c @ _clean(b.range.center))
+    start = normalised(_times(c, formless(subtract(b, _times(a, x)))))
+    u, proved = _fixed_radius(magnitude(error), magnitude(start.range))
+    y = box_sum(start.range, _image(error, Interval.unchecked(-u, u)))
     y = Interval.unchecked(jnp.maximum(y.lower, -u), jnp.minimum(y.upper, u))
-    left = _image(error, y)
-    moved = add(add(start, Node(left)), _as_rest(x, a.dtype))
-    natural = choose(proved, normalised(moved).range, entire_like(y))
-    form = normalised(moved).form
+    moved = normalised(add(add(start, Node(_image(error, y))), as_node(x, x.shape, a.dtype)))
+    natural, form = choose(proved, moved.range, entire_like(y)), moved.form
     if form is not None:
         form = type(form)(
             jnp.where(proved, form.slope, 0),
@@ -101,37 +106,31 @@ def _solve_columns(a: Node, b: Node) -> Node:
             form.box,
             None if form.slack is None else jnp.where(proved, form.slack, 0),
         )
-    _, jac = parts([a, b])
-    if jac is not None:
-        jac = _derivative(a, b, c, error, small, natural)
-    return meet(Node(natural, form, jac))
+    return meet(Node(natural, form))
 
 
-def _as_rest(x: Any, dtype: Any) -> Node:
-    return Node(Interval.unchecked(x.astype(dtype), x.astype(dtype)))
-
-
-def _derivative(a: Node, b: Node, c: Any, error: Interval, small: Any, x: Interval) -> Interval:
-    """``dx = C (db - dA x) + E dx`` for every entry of the box: (size, n, m)."""
+def _derivative(a: Node, b: Node, x: Node, inverse: Node) -> Interval:
+    """``A^-1 (db - dA x)`` for every entry of the box: (size, n, m), from products of forms: what x and the inverse
+    have in common is not lost."""
     size = next(v.jac.lower.shape[0] for v in (a, b) if v.jac is not None)
     ja, jb = jac_of(a, size), jac_of(b, size)
-    right = box_sum(jb, _flip(_image(ja, x)))
-    wide = Interval.unchecked(*(jnp.broadcast_to(side, (size, *side.shape)) for side in (c, c)))
-    start = _image(wide, right)
-    u, proved = _fixed_radius(small, magnitude(start))
-    spread = Interval.unchecked(-u, u)
-    every = Interval.unchecked(*(jnp.broadcast_to(side, (size, *side.shape)) for side in (error.lower, error.upper)))
-    found = box_sum(start, _image(every, spread))
-    found = Interval.unchecked(jnp.maximum(found.lower, -u), jnp.minimum(found.upper, u))
-    found = box_sum(start, _image(every, found))
-    found = choose(proved, found, entire_like(found))
+    tangent = Tangents(size)
+    moved = move(lambda v: v.reshape(size, *x.shape), tangent(b))
+    right = subtract(moved, _products(normalised(tangent(a)), x))
+    found = normalised(_products(inverse, normalised(right))).range
     # An entry of the box on which neither side depends.
-    still = ((right.lower == 0) & (right.upper == 0)).all((-2, -1), keepdims=True)
-    return choose(still & proved, Interval.unchecked(0.0, 0.0), found)
+    flat = [((side.lower == 0) & (side.upper == 0)).reshape(size, -1).all(1) for side in (ja, jb)]
+    still = (flat[0] & flat[1])[:, None, None]
+    return choose(still & jnp.isfinite(inverse.range.lower).all(), Interval.unchecked(0.0, 0.0), found)
 
 
-def _flip(a: Interval) -> Interval:
-    return Interval.unchecked(-a.upper, -a.lower)
+def _products(a: Node, b: Node) -> Node:
+    """Matrix products (..., n, k) (..., k, m), of which one has an axis before."""
+    (n, k), m = a.shape[-2:], b.shape[-1]
+    shape = (*(a.shape[:-2] or b.shape[:-2]), n, k, m)
+    wide_a = move(lambda v: jnp.broadcast_to(v[..., None], shape), a)
+    wide_b = move(lambda v: jnp.broadcast_to(v[..., None, :, :], shape), b)
+    return total(multiply(wide_a, wide_b), [len(shape) - 2])
 
 
 def _fixed_radius(small: Any, reached: Any) -> tuple[Any, Any]:
