@@ -35,7 +35,7 @@ from gsisio_jax.inclusion.node import (
     parts,
     slope_of,
 )
-from gsisio_jax.inclusion.origin import remember
+from gsisio_jax.inclusion.origin import remember, settled
 from gsisio_jax.inclusion.rules import comparison, linear, patterns
 from gsisio_jax.inclusion.rules.indexing import TooManyPlacesError
 from gsisio_jax.inclusion.rules.library import EXACT, WHOLE
@@ -184,7 +184,7 @@ def _given(name: str, eqn: Any, args: Sequence[Any]) -> list[Any] | None:
     """Arguments for the rule of a whole function, None where there is nothing to bound: without a node that is so to
     nearest, and of a result that is exact. Numbers that are not known while tracing become nodes, as in `_constant`."""
     if any(map(is_node, args)):
-        return list(map(normalised, args))
+        return list(map(settled, args))
     if name in EXACT or not rounding.outward() or not any(isinstance(arg, Tracer) for arg in args):
         return None
     avals = [atom.aval for atom in eqn.invars]

@@ -5,4 +5,3 @@ from __future__ import annotations
 from oracles import real_activations, real_arrays, real_library
 
 FUNCTIONS = real_library.FUNCTIONS | real_activations.FUNCTIONS | real_arrays.FUNCTIONS
-NEW = [*real_activations.FUNCTIONS, *real_arrays.FUNCTIONS]

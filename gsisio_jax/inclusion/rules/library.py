@@ -20,7 +20,7 @@ from jax.core import Tracer
 
 from gsisio_jax.inclusion.form_arithmetic import known_if_concrete
 from gsisio_jax.inclusion.node import Node, as_node, is_node, normalised
-from gsisio_jax.inclusion.rules import activations, solving, vectors
+from gsisio_jax.inclusion.rules import activations, factors, solving, vectors
 from gsisio_jax.inclusion.rules.comparison import select, step
 from gsisio_jax.inclusion.rules.functions import CURVES
 from gsisio_jax.inclusion.rules.gates import GATES
@@ -135,13 +135,13 @@ def _square(a: Any) -> int | None:
 
 
 def _det(eqn: Any, a: Node) -> list[Any] | None:
-    return [solving.determinant(a)] if _square(a) else None
+    return [factors.determinant(a)] if _square(a) else None
 
 
 def _slogdet(eqn: Any, a: Node) -> list[Any] | None:
     if not _square(a):
         return None
-    found = normalised(solving.determinant(a))
+    found = normalised(factors.determinant(a))
     sign = jnp.sign(found.range.lower), jnp.sign(found.range.upper)
     jac = found.jac
     if jac is not None:

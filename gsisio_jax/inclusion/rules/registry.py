@@ -22,6 +22,7 @@ from gsisio_jax.inclusion.rules import (
     bilinear,
     comparison,
     convolution,
+    factors,
     functions,
     indexing,
     library,
@@ -294,10 +295,10 @@ MOVES |= {
     "top_k": order.top_k,
     "argmax": order.argmax,
     "argmin": order.argmin,
-    "lu": lambda eqn, a: solving.lu(a),
-    # Of pivots that say "none" or nothing at all, which are the ones that `solving.lu` makes.
+    "lu": lambda eqn, a: factors.lu(a),
+    # Of pivots that say "none" or nothing at all, which are the ones that `factors.lu` makes.
     "lu_pivots_to_permutation": lambda eqn, pivots: Node(pivots.range, None, pivots.jac),
-    "cholesky": lambda eqn, a: solving.cholesky(a),
+    "cholesky": lambda eqn, a: factors.cholesky(a),
     "triangular_solve": solving.triangular_solve,
     "custom_linear_solve": library.linear_system,
     "debug_callback": lambda eqn, *args: [],

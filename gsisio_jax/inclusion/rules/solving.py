@@ -1,23 +1,20 @@
-"""Linear algebra of small matrices whose entries depend on the box: systems, determinants, factors.
+"""Linear systems of small matrices whose entries depend on the box.
 
-**Systems.** With C near the inverse of A at its center and any vector x~, the solution of ``A x = b`` is
+With C near the inverse of A at its center and any vector x~, the solution of ``A x = b`` is
 
     x = x~ + y,    y = C r + E y,    r = b - A x~,    E = I - C A.
 
 r is linear in A and b, so C r keeps slopes, while ``E y`` is of second order in the widths and goes to the offset. A
 vector u > 0 with ``|E| u + |C r| <= u`` and, strictly, ``|E| u < u`` proves that every A of the enclosure is regular
 (the spectral radius of E is below 1) and that ``|y| <= u``; one is computed to nearest and then checked, rounded
-outward. Without one nothing is known of x: the bounds are infinite. Derivatives solve the same system,
-``dx = A^-1 (db - dA x)``. C and x~ are numbers like any others: how well they are known makes no difference to what is
-proved. A matrix that does not depend on the box is inverted in fractions.
-
-**Determinants** are expanded by rows over all minors of the last columns; **factors** are eliminated entry by entry,
-without exchange of rows: what does not hold for all matrices of the enclosure is not known.
+outward. Without one nothing is known of x: the bounds are infinite. Derivatives are ``A^-1 (db - dA x)``, with an
+inverse that is the solution for the unit vectors, and with what `tangents` knows of dA and db. C and x~ are numbers
+like any others: how well they are known makes no difference to what is proved. A matrix that does not depend on the box
+is inverted in fractions.
 """
 
 from __future__ import annotations
 
-import itertools
 from fractions import Fraction
 from typing import Any
 
@@ -27,19 +24,16 @@ import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import box_sum, is_known, product
 from gsisio_jax.inclusion.node import Node, as_node, is_node, jac_of, meet, normalised, parts
-from gsisio_jax.inclusion.rules.bilinear import divide, multiply
-from gsisio_jax.inclusion.rules.functions import CURVES, SQUARE
+from gsisio_jax.inclusion.rules.bilinear import multiply
 from gsisio_jax.inclusion.rules.linear import add, move, multiple, structural, subtract, total
 from gsisio_jax.inclusion.rules.possible import formless, unknown
 from gsisio_jax.inclusion.rules.tangents import Tangents
-from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, magnitude
 
 MOST_ROWS = 12
 
 
-# Systems --------------------------------------------------------------------------------------------------------------
 def solve(a: Any, b: Any) -> Any:
     """Solution of ``a x = b``; a (n, n), b (n,) or (n, m), nodes or constants, one of them a node."""
     if not is_node(a):
@@ -208,79 +202,6 @@ def _exact_inverse(a: np.ndarray) -> np.ndarray | None:
                 factor = rows[i][k]
                 rows[i] = [v - factor * w for v, w in zip(rows[i], rows[k], strict=True)]
     return np.array([[float(v) for v in row[n:]] for row in rows])
-
-
-# Determinants ---------------------------------------------------------------------------------------------------------
-def determinant(a: Node) -> Node:
-    """Of a node (n, n), over the minors of its first k rows: n products of arrays."""
-    n = a.shape[0]
-    minors = move(lambda v: v[0], a)  # of row 0 and column j
-    before: list[tuple[int, ...]] = [(j,) for j in range(n)]
-    for k in range(1, n):
-        sets = list(itertools.combinations(range(n), k + 1))
-        columns = np.array(sets)
-        rest = np.array([[before.index(s[:i] + s[i + 1 :]) for i in range(k + 1)] for s in sets])
-        signs = np.array([(-1.0) ** (k - i) for i in range(k + 1)])
-        row = move(lambda v, k=k, columns=columns: v[k][columns], a)
-        below = move(lambda v, rest=rest: v[rest], minors)
-        signed = multiple(np.broadcast_to(signs, rest.shape), below)
-        minors, before = total(multiply(row, signed), [1]), sets
-    return move(lambda v: v[0], minors)
-
-
-# Factors --------------------------------------------------------------------------------------------------------------
-def _entries(a: Node) -> list[list[Any]]:
-    n, m = a.shape
-    return [[move(lambda v, i=i, j=j: v[i, j], a) for j in range(m)] for i in range(n)]
-
-
-def _matrix(rows: list[list[Any]]) -> Node:
-    flat = [v for row in rows for v in row]
-    shape = (len(rows), len(rows[0]))
-    return structural(lambda *v: jnp.stack(v).reshape(shape), flat)[0]
-
-
-def cholesky(a: Node) -> Node:
-    """The lower factor L of ``a = L L'``; only the lower triangle of a is looked at."""
-    n, entries = a.shape[0], _entries(normalised(a))
-    zero = np.zeros((), a.dtype)
-    factor: list[list[Any]] = [[zero] * n for _ in range(n)]
-    for j in range(n):
-        rest = entries[j][j]
-        for k in range(j):
-            rest = subtract(rest, apply(SQUARE, factor[j][k]))
-        factor[j][j] = apply(CURVES["sqrt"], normalised(rest))
-        for i in range(j + 1, n):
-            rest = entries[i][j]
-            for k in range(j):
-                rest = subtract(rest, multiply(factor[i][k], factor[j][k]))
-            factor[i][j] = normalised(divide(normalised(rest), factor[j][j]))
-    return _matrix(factor)
-
-
-def lu(a: Node) -> list[Node]:
-    """Factors, pivots and permutation, as long as no row needs to be exchanged; else nothing is known of them."""
-    n, rows = a.shape[0], _entries(normalised(a))
-    certain = jnp.ones((), bool)
-    for k in range(n):
-        pivot = normalised(rows[k][k]).range
-        least = jnp.where((pivot.lower <= 0) & (pivot.upper >= 0), 0, jnp.minimum(abs(pivot.lower), abs(pivot.upper)))
-        certain &= least > 0
-        for i in range(k + 1, n):
-            certain &= magnitude(normalised(rows[i][k]).range) < least
-            rows[i][k] = normalised(divide(rows[i][k], rows[k][k]))
-            for j in range(k + 1, n):
-                rows[i][j] = normalised(subtract(rows[i][j], multiply(rows[i][k], rows[k][j])))
-    factors = _matrix(rows)
-    nothing = unknown(a.shape, a.dtype, [a])
-    found = structural(lambda p, q: jnp.where(certain, p, q), [factors, nothing], [certain])[0]
-    places = np.arange(n, dtype=float)
-    order = Interval.unchecked(jnp.where(certain, places, 0), jnp.where(certain, places, n - 1.0))
-    jac = None
-    if a.jac is not None:
-        flat = jnp.zeros((a.jac.lower.shape[0], n))
-        jac = choose(certain, Interval.unchecked(flat, flat), entire_like(flat))
-    return [found, Node(order, None, jac), Node(order, None, jac)]
 
 
 def triangular_solve(eqn: Any, a: Any, b: Any) -> Any:

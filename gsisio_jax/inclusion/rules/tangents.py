@@ -1,9 +1,11 @@
 """Derivatives with forms: how a node changes with x, as a node of its own that is again a function of x.
 
-The Jacobian of a node is a box for every entry, which forgets that the derivatives of two nodes change together. Where
-terms of a derivative cancel, as in ``db - dA x`` of a linear system, that makes the result many times too wide. So where
-it matters, derivatives are built once more by the rules of differentiation from where a node comes from (`origin`), with
-forms. What has no rule here enters with its Jacobian: a box without a form, sound for every function.
+The Jacobian of a node is a box for every entry, which forgets that derivatives of two nodes change together. Where
+terms of a derivative cancel, as in ``db - dA x`` of a linear system, that makes the result many times too wide. So
+where it matters, derivatives are built once more by the rules of differentiation from where a node comes from
+(`origin`), with forms. What has no rule here enters with its Jacobian: a box without a form, sound for every function.
+Of functions with kinks that is the hull of both sides, so the change along a segment still lies in the tangent times
+the segment.
 
 A tangent has the axis over the entries of x first, as Jacobians have.
 """
@@ -147,13 +149,10 @@ class Tangents:
     def _times(self, factor: Any, tangent: Node) -> Node:
         """A factor in the shape of the node, times a tangent."""
         shape = tangent.shape
-        factor = (
-            move(lambda v: jnp.broadcast_to(v[None], shape), factor)
-            if is_node(factor)
-            else np.broadcast_to(factor, shape)
-            if is_known(factor)
-            else jnp.broadcast_to(factor, shape)
-        )
+        if is_node(factor):
+            factor = move(lambda v: jnp.broadcast_to(v[None], shape), factor)
+        else:
+            factor = (np if is_known(factor) else jnp).broadcast_to(factor, shape)
         return multiply(normalised(factor), normalised(tangent))
 
     def _product(self, found: Origin, operands: Any, tangents: Any) -> Any:
