@@ -32,6 +32,7 @@ from gsisio_jax.interval.box import Interval, choose, entire_like
 
 Rule = Callable[..., list[Any] | None]
 _TABLES: dict[Any, PiecewiseLinear | None] = {}
+_MOST_TABLES = 256  # kept of one process
 
 
 def _concrete(*values: Any) -> bool:
@@ -65,6 +66,8 @@ def _interp(eqn: Any, x: Any, knots: Any, values: Any, *others: Any) -> list[Any
     others = tuple(np.asarray(known_if_concrete(v)) for v in others)
     key = (str(eqn.params["jaxpr"]), knots.tobytes(), values.tobytes(), *(v.tobytes() for v in others))
     if key not in _TABLES:
+        if len(_TABLES) >= _MOST_TABLES:
+            _TABLES.pop(next(iter(_TABLES)))  # the oldest
         _TABLES[key] = interpolation(eqn, knots, values, others)
     table = _TABLES[key]
     if table is None:

@@ -103,11 +103,12 @@ class PiecewiseLinear:
     def _points(self, a: Any, b: Any, s: Any) -> tuple[Any, Any, Any]:
         """``phi - s t`` at every knot, which of them lie between a and b, and what the error goes with."""
         knots, values = self.knots, self.values
-        inside = (a[..., None] <= knots) & (knots <= b[..., None])
+        inside = met = (a[..., None] <= knots) & (knots <= b[..., None])
+        reaches = a < self.knots[0], b > self.knots[-1]
         for k, jump in zip((0, -1), self.jumps, strict=True):
             if jump:
                 # The limit from outside, where that is part of the interval.
-                beyond = inside[..., k] & ((a if k == 0 else -b) < (knots[0] if k == 0 else -knots[-1]))
+                beyond = met[..., k] & reaches[k]
                 inside = jnp.concatenate([inside, beyond[..., None]], -1)
                 knots, values = np.append(knots, self.knots[k]), np.append(values, self.beyond[k])
         if s is None:
