@@ -134,7 +134,7 @@ class hashable:
 
     def __init__(self, function: Callable[..., Any]):
         self.function = function
-        functools.update_wrapper(self, function)
+        self.__doc__ = function.__doc__
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         return self.function if instance is None else functools.partial(self.function, instance)

@@ -82,7 +82,7 @@ class Tangents:
     def _rule(self, found: Origin) -> Any:
         """The tangent by the rule of the primitive, None where there is none."""
         name, operands = found.name, [formless(v) if is_node(v) else v for v in found.operands]
-        tangents = [self(v) if is_node(v) else None for v in found.operands]
+        tangents: list[Any] = [self(v) if is_node(v) else None for v in found.operands]
         if name in _MOVES:
             return self._moved(found, tangents)
         if name in ("add", "add_any", "sub"):
@@ -179,7 +179,7 @@ class Tangents:
             return None
         moved = tuple(axis + 1 for axis in contract[k])
         pair = (moved, contract[1]) if k == 0 else (contract[0], moved)
-        values = (normalised(tangent), other) if k == 0 else (other, normalised(tangent))
+        first, second = (tangent, other) if k == 0 else (other, tangent)
         free = 0 if k == 0 else len(np.shape(other) if not is_node(other) else other.shape) - len(contract[0])
-        out = dot(*(normalised(v) for v in values), (pair, ((), ())), False)
+        out = dot(normalised(first), normalised(second), (pair, ((), ())), False)
         return out if not free else move(lambda v: jnp.moveaxis(v, free, 0), out)
