@@ -3,6 +3,7 @@
 import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -221,3 +222,11 @@ def test_what_a_function_counts_by_itself_is_no_change():
     observer = gx.design_observer(gx.System(f, _x, **ONE), SMALL, region=_region(), missing=False)
     gx.estimate(observer, _region(), np.zeros((2, 1)))
     assert calls > 0
+
+
+def test_maps_of_a_system_can_be_compiled():
+    system = gx.System(lambda x: 0.5 * x, lambda x: x[:1], G=[[0.0], [1.0]], H=[[0.0]])
+    x, u = jnp.ones(2), jnp.zeros(0)
+    assert jax.jit(system.dynamics)(x, u).tolist() == [0.5, 0.5]
+    assert jax.jit(system.measurement)(x, u).tolist() == [1.0]
+    assert jax.jit(system.maps)(x, u).tolist() == [0.5, 0.5, 1.0]

@@ -35,10 +35,10 @@ from gsisio_jax.inclusion.node import (
     parts,
     slope_of,
 )
-from gsisio_jax.inclusion.origin import remember
+from gsisio_jax.inclusion.origin import remember, settled
 from gsisio_jax.inclusion.rules import comparison, linear, patterns
 from gsisio_jax.inclusion.rules.indexing import TooManyPlacesError
-from gsisio_jax.inclusion.rules.library import WHOLE
+from gsisio_jax.inclusion.rules.library import EXACT, WHOLE
 from gsisio_jax.inclusion.rules.piecewise import by_pieces
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
 from gsisio_jax.inclusion.turns import TurnsError, while_loop
@@ -170,13 +170,30 @@ def _call(eqn: Any, *args: Any) -> Any:
         raise UnknownPrimitiveError(eqn.primitive.name, "without a body") from None
     name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
     ours = source.startswith(_JAX)
-    if ours and name in WHOLE and any(is_node(arg) or isinstance(arg, Tracer) for arg in args):
-        found = WHOLE[name](eqn, *map(normalised, args))
+    whole = WHOLE.get(name) if ours else None
+    if whole is not None and (given := _given(name, eqn, args)) is not None:
+        found = whole(eqn, *given)
         if found is not None:
             return [normalise(value) if is_node(value) else value for value in found]
     if name in LIBRARY and ours and any(is_node(arg) for arg in args):
         return [normalise(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
     return evaluate(jaxpr, consts, args)
+
+
+def _given(name: str, eqn: Any, args: Sequence[Any]) -> list[Any] | None:
+    """Arguments for the rule of a whole function, None where there is nothing to bound: without a node that is so to
+    nearest, and of a result that is exact. Numbers that are not known while tracing become nodes, as in `_constant`."""
+    if any(map(is_node, args)):
+        return list(map(settled, args))
+    if name in EXACT or not rounding.outward() or not any(isinstance(arg, Tracer) for arg in args):
+        return None
+    avals = [atom.aval for atom in eqn.invars]
+    return [
+        as_node(arg, aval.shape, aval.dtype)
+        if isinstance(arg, Tracer) and jnp.issubdtype(aval.dtype, jnp.floating)
+        else arg
+        for arg, aval in zip(args, avals, strict=True)
+    ]
 
 
 def _cond(eqn: Any, index: Any, *args: Any) -> Any:

@@ -56,6 +56,14 @@ def origin(value: Any) -> Origin | None:
     return getattr(value, "origin", None)
 
 
+def settled(value: Any) -> Any:
+    """`normalised`, of the same origin."""
+    found = normalised(value)
+    if found is not value and (before := origin(value)) is not None:
+        object.__setattr__(found, "origin", before)
+    return found
+
+
 def made_by(value: Any, *names: str) -> Sequence[Any] | None:
     """The operands of a node, if one of these primitives made it."""
     found = origin(value)

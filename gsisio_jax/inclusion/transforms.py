@@ -199,9 +199,14 @@ def _in_type(node: Node, dtype: Any) -> Node:
         return node
     form = node.form
     if form is not None:
-        slope = jnp.asarray(form.slope).astype(dtype)
-        lost = abs(slope) * np.dtype(dtype).type(2 * jnp.finfo(dtype).eps)
-        slack = sum_slack(lost, None if form.slack is None else (2 * form.slack).astype(dtype))
+        slope, info = jnp.asarray(form.slope).astype(dtype), jnp.finfo(dtype)
+
+        def raised(lost: Any, some: Any) -> Any:
+            """In the narrower type, in which what is lost of a small slope would vanish."""
+            return lost.astype(dtype) + jnp.where(some, info.tiny, 0).astype(dtype)
+
+        lost = raised(2 * float(info.eps) * abs(slope), form.slope != 0)
+        slack = sum_slack(lost, None if form.slack is None else raised(2 * form.slack, form.slack != 0))
         domain = InputBox(
             *(jnp.asarray(side).astype(dtype) for side in (form.box.lower, form.box.upper, form.box.magnitude))
         )

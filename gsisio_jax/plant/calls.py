@@ -14,7 +14,7 @@ _POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_O
 _NONE = inspect.Parameter.empty
 
 
-def takes_u(function: Callable[..., Any], name: str, m: int | None) -> bool:
+def takes_u(function: Callable[..., Any], name: str, m: int | None) -> tuple[bool, str]:
     """Is the map called as ``function(x, u)``, or as ``function(x)``? Decided by its signature and by m alone.
 
     A second parameter without a default is the known input. One with a default is, where there are known inputs
@@ -25,6 +25,9 @@ def takes_u(function: Callable[..., Any], name: str, m: int | None) -> bool:
         name: "f" or "g".
         m: number of known inputs; None where it is not known yet.
 
+    Returns:
+        The answer, and a hint for known inputs that reach nothing: an optional argument that could be meant for them.
+
     Raises:
         ValueError: it is no function, or cannot be called with x or (x, u).
     """
@@ -33,7 +36,7 @@ def takes_u(function: Callable[..., Any], name: str, m: int | None) -> bool:
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):  # builtins without a signature
-        return False
+        return False, ""
     _check_keywords(function, name, parameters)
     places = [p for p in parameters if p.kind in _POSITIONAL]
     required = [p for p in places if p.default is _NONE]
@@ -44,19 +47,11 @@ def takes_u(function: Callable[..., Any], name: str, m: int | None) -> bool:
             f"({', '.join(p.name for p in required)}); bind parameters with functools.partial"
         )
     if len(required) == 2:
-        return True
-    optional = places[1:2]
-    return bool(m) and (optional[0].name == "u" if optional else many)
-
-
-def not_passed(function: Callable[..., Any]) -> str:
-    """A hint for known inputs that reach nothing: an optional argument that could be meant for them."""
-    try:
-        places = [p for p in inspect.signature(function).parameters.values() if p.kind in _POSITIONAL]
-    except (TypeError, ValueError):
-        return ""
-    optional = [p for p in places[1:2] if p.default is not _NONE and p.name != "u"]
-    return f" The optional argument `{optional[0].name}` is not passed: call it `u` if it is meant." if optional else ""
+        return True, ""
+    second = places[1].name if len(places) > 1 else None
+    if second is None or second == "u":
+        return bool(m) and (second == "u" or many), ""
+    return False, f" The optional argument `{second}` is not passed: call it `u` if it is meant."
 
 
 def _check_keywords(function: Callable[..., Any], name: str, parameters: list[inspect.Parameter]) -> None:
@@ -131,3 +126,15 @@ def _remedy(error: Exception) -> str:
     if isinstance(error, jax.errors.TracerBoolConversionError | jax.errors.ConcretizationTypeError):
         return ". Python's `if`, `and` and float() cannot depend on x; use jnp.where, jnp.logical_and, jax.lax.cond"
     return ""
+
+
+class hashable:
+    """A method of an Equinox module that ``jax.jit`` takes. Equinox would make it a pytree, and the hash of that is one
+    of the module's arrays, which have none; this is a plain function with the module bound to it."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self.__doc__ = function.__doc__
+
+    def __get__(self, instance: Any, owner: Any = None) -> Any:
+        return self.function if instance is None else functools.partial(self.function, instance)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval, is_concrete
-from gsisio_jax.plant.calls import as_vector, check_map, not_passed, takes_u
+from gsisio_jax.plant.calls import as_vector, check_map, hashable, takes_u
 from gsisio_jax.plant.captured import Captured, captured, changed
 from gsisio_jax.plant.periodic import Periods, check_feedthrough, check_states, read_periods, turns
 
@@ -89,8 +89,8 @@ class System(eqx.Module):
                 "unknown input (give zero columns where an input does not act)"
             )
         m = _known_inputs(B, D, m)
-        self.f_takes_u, self.g_takes_u = takes_u(f, "f", m), takes_u(g, "g", m)
-        m = _checked_inputs(m, self.f_takes_u or self.g_takes_u, B, D, not_passed(f) or not_passed(g))
+        (self.f_takes_u, f_hint), (self.g_takes_u, g_hint) = takes_u(f, "f", m), takes_u(g, "g", m)
+        m = _checked_inputs(m, self.takes_u, B, D, f_hint or g_hint)
         self.B = np.zeros((self.n, m)) if B is None else _matrix("B", B, (self.n, m))
         self.D = np.zeros((self.l, m)) if D is None else _matrix("D", D, (self.l, m))
         _check_rank(self.G, self.H)
@@ -131,10 +131,12 @@ class System(eqx.Module):
         """f or g takes the known input, so enclosures of their derivatives depend on it."""
         return self.f_takes_u or self.g_takes_u
 
+    @hashable
     def dynamics(self, x: Any, u: Any) -> Any:
         """``f(x)`` or ``f(x, u)``, whichever the user gave."""
         return as_vector(self.f(x, u) if self.f_takes_u else self.f(x), self.n, x.dtype)
 
+    @hashable
     def measurement(self, x: Any, u: Any) -> Any:
         """``g(x)`` or ``g(x, u)``, whichever the user gave."""
         return as_vector(self.g(x, u) if self.g_takes_u else self.g(x), self.l, x.dtype)
@@ -149,6 +151,7 @@ class System(eqx.Module):
                     "again), or give every system its own values, with functools.partial or a function that returns f"
                 )
 
+    @hashable
     def maps(self, x: Any, u: Any) -> Any:
         """f and g together, (n + l,)."""
         return jnp.concatenate([self.dynamics(x, u), self.measurement(x, u)])

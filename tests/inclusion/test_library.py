@@ -57,6 +57,11 @@ CASES = {
     "soft_sign": (jax.nn.soft_sign, lambda x: x / (1 + abs(x)), WIDE, 1.01, 1.05),
     "sinc": (jnp.sinc, np.sinc, ([-0.4, 0.7], [2.7, 9.3]), 1.05, 1.2),
     "logit": (jax.scipy.special.logit, scipy.special.logit, USUAL, 1.01, 1.05),
+    "celu": (lambda x: jax.nn.celu(x, 0.5), lambda x: np.where(x > 0, x, 0.5 * np.expm1(2 * np.minimum(x, 0))),
+             ([-4.0, -1.0], [3.0, 0.5]), 1.01, 1.05),
+    "entr": (jax.scipy.special.entr, scipy.special.entr, USUAL, 1.01, 1.05),
+    "logaddexp2": (lambda x: jnp.logaddexp2(x[0], x[1]), lambda x: np.logaddexp2(x[0], x[1]), WIDE, 1.01, 1.05),
+    "std": (jnp.std, np.std, THREE, 2.5, 2.5),
     "erfc": (jax.scipy.special.erfc, scipy.special.erfc, WIDE, 1.01, 1.05),
     "copysign": (lambda x: jnp.copysign(x[0], x[1]), lambda x: np.copysign(x[0], x[1]), WIDE, 1.01, None),
     "fmax": (lambda x: jnp.fmax(x[0], x[1]), lambda x: np.fmax(x[0], x[1]), WIDE, 1.01, 1.01),
@@ -105,6 +110,43 @@ def test_tables_beyond_their_ends():
     assert _pair(form.offset) == [-1, -1]
     assert _pair(inclusion.natural(f, "nearest")(Interval([-np.inf], [0.125]))) == [-np.inf, 0.5]
     assert _pair(inclusion.natural(lambda x: jnp.interp(x, FEW, VALUES))(Interval.entire(1))) == [0, 2]
+
+
+def test_tables_that_jump_at_both_ends():
+    """What is left of a slope holds the values beyond the ends, on infinite boxes and on wide ones."""
+
+    def f(x):
+        return jnp.interp(x, FEW, VALUES, left=-1.0, right=3.0)
+
+    affine = jax.jit(inclusion.affine(f, "nearest"))
+    for lower, upper in ((-np.inf, np.inf), (-np.inf, 0.5), (0.1, np.inf), (0.1, 1e80), (-1e80, 0.3), (-5.0, 7.0)):
+        form = affine(Interval([lower], [upper]))
+        t = np.clip([-1e300, -1e70, -1.0, -1e-9, 0.0, 0.2, 0.25, 0.6, 1.0, 1.0 + 1e-9, 3.0, 1e70, 1e300], lower, upper)
+        rest = np.interp(t, FEW, VALUES, left=-1.0, right=3.0) - float(np.ravel(form.slope)[0]) * t
+        slip = 1e-9 * (1 + abs(float(np.ravel(form.slope)[0]) * t))
+        assert (form.offset.lower - slip <= rest).all()
+        assert (rest <= form.offset.upper + slip).all()
+
+
+def test_known_inputs_in_library_functions():
+    """Numbers that are not known while tracing, in functions that are known as a whole: their rounding is bounded."""
+
+    def each(u):
+        pair = jnp.stack([u, 2 * u])
+        parts = [jax.nn.silu(u), jax.nn.celu(u), jnp.sinc(u), jnp.hypot(u, u), jnp.std(pair), jnp.linalg.norm(pair)]
+        return jnp.stack([*parts, jax.scipy.special.entr(u), jnp.searchsorted(FEW, u) * 1.0])
+
+    def bounds_of(x, u):
+        return [inclusion.natural(lambda x, u: x + each(u), r)(x, u) for r in ("outward", "nearest")]
+
+    outward, nearest = jax.jit(bounds_of)(Interval([0.0], [0.0]), 0.437)
+    u = 0.437
+    silu, std, norm = u * _sigmoid(u), 0.5 * u, u * np.sqrt(5)
+    exact = np.array([silu, u, np.sinc(u), u * np.sqrt(2), std, norm, -u * np.log(u), 2.0])
+    assert (outward.lower < exact).all()
+    assert (exact < outward.upper).all()
+    assert np.allclose(nearest.lower, exact, 1e-12, 0)
+    assert (outward.width < 1e-12).all()
 
 
 def test_a_table_with_a_period_or_a_jump_is_walked_as_any_other_function():

@@ -38,6 +38,7 @@ class Real:
         domain: of the first argument, the others may be any number. Partials are looked at inside only.
         linear: coefficients of a linear function: what is left after a slope is taken off is then known exactly.
         special: points near which something happens (turning points, poles, ends of a range).
+        arguments: n, where the signature of `value` does not say.
     """
 
     fn: Callable[[Any], Any]
@@ -48,10 +49,11 @@ class Real:
     domain: tuple[float, float] = REALS
     special: Sequence[float] = (0.0, 1.0, -1.0)
     linear: Sequence[Any] | None = None
+    arguments: int | None = None
 
     @property
     def size(self) -> int:
-        return self.value.__code__.co_argcount
+        return self.arguments or self.value.__code__.co_argcount
 
 
 def _one(fn: Any, value: Any, slope: Any, ball: Any, ball_slope: Any, domain: Any = REALS, special: Any = ()) -> Real:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flint import arb, ctx
-from oracles.real_library import FUNCTIONS
+from oracles.real_all import FUNCTIONS
 from sampling import boxes, points
 
 from gsisio_jax import Interval, inclusion

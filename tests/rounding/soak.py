@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from checks import Tally, check, check_forms
 from oracles.exact_sums import product, sign
-from oracles.real_library import FUNCTIONS
+from oracles.real_all import FUNCTIONS
 from plants import LINEAR, NONLINEAR, QUADRATIC
 from runs import Runs, estimator, run
 
@@ -22,7 +23,10 @@ from gsisio_jax.interval.rounding import Rounding
 
 BOXES, POINTS = 8192, 24
 # Whose oracle is slow: fewer boxes.
-RARE = {"power": 16, "atan2": 16, "remainder": 2, "modulo": 2, "power 2.5": 4, "power 0.25": 4, "power -1.5": 4}
+RARE = {
+    "power": 16, "atan2": 16, "remainder": 2, "modulo": 2, "power 2.5": 4, "power 0.25": 4, "power -1.5": 4,
+    "sinc": 16, "gelu": 16, "wrapped angle": 16, "softmax of three": 16, "spread": 8, "dead zone": 8,
+}  # fmt: skip
 # Plant: share of all steps, runs of a batch, steps of a run.
 SHARES = {
     "no unknown input": (0.36, 500, 10_000),
@@ -44,20 +48,25 @@ def _tell(what: str, done: int, misses: int, examples: list[Any], started: float
     print(line, *examples[:3], sep="\n    ", file=sys.stderr, flush=True)
 
 
-def primitives(dtype: Any, points: float, seed: int, rounding: Rounding = "outward") -> dict[str, Any]:
+def primitives(
+    dtype: Any, points: float, seed: int, rounding: Rounding = "outward", names: Sequence[str] = tuple(FUNCTIONS)
+) -> dict[str, Any]:
     """Every function in turn until so many (function, box, point) were looked at."""
-    total, started, turns = Tally(), time.perf_counter(), 0
-    many = int(min(BOXES, max(points / (POINTS * len(FUNCTIONS)), 64)))
+    total, started, turns, blind = Tally(), time.perf_counter(), 0, set(names)
+    many = int(min(BOXES, max(points / (POINTS * len(names)), 64)))
     while total.points < points:
-        for name in FUNCTIONS:
-            total.add(check(name, seed + turns, max(many // RARE.get(name, 1), 64), POINTS, dtype, rounding))
+        for name in names:
+            found = check(name, seed + turns, max(many // RARE.get(name, 1), 64), POINTS, dtype, rounding)
+            blind -= {name} if found.misses else set()
+            total.add(found)
         turns += 1
         _tell("primitives", total.points, total.misses, total.examples, started)
     closest = {name: float(f"{room:.3g}") for name, room in total.closest.items() if np.isfinite(room)}
     least = sorted((room, name) for name, room in closest.items() if room > 0)[:5]
     return {
         "what": "primitives",
-        "functions": len(FUNCTIONS),
+        "functions": len(names),
+        "without_a_miss": sorted(blind) if rounding == "nearest" else len(blind),
         "points": total.points,
         "checks": total.checks,
         "misses": total.misses,

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from checks import Tally, bounds_of, check, check_forms, compare
 from flint import arb, ctx
-from oracles.real_library import FUNCTIONS
+from oracles.real_all import FUNCTIONS
 from sampling import boxes, points
 
 NAMES = list(FUNCTIONS)
 DTYPES = [np.float64, np.float32]
-# Every sixth function in one precision, another sixth in the other; the whole table in both is `test_soak`.
-SLICES = [(np.float64, NAMES[0::6]), (np.float32, NAMES[3::6])]
+# Every twelfth function in one precision, another twelfth in the other; the whole table in both is `test_soak`.
+SLICES = [(np.float64, NAMES[0::12]), (np.float32, NAMES[6::12])]
 
 
 @pytest.mark.parametrize(("dtype", "names"), SLICES, ids=["float64", "float32"])
@@ -26,7 +26,7 @@ def test_no_value_lies_outside_of_its_bounds(dtype, names):
         tally.add(check(name, 0, 512, 24, dtype))
     assert tally.misses == 0, tally.examples[:5]
     assert tally.points > 80_000
-    assert tally.skipped < tally.checks // 100
+    assert tally.skipped < tally.checks // 25  # sums of exponentials, mostly: too wide in double precision
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=["float64", "float32"])

@@ -1,5 +1,5 @@
-"""Functions of one variable that are written as products or quotients, known as a whole: silu, gelu, mish, soft_sign,
-squareplus, hard_silu, sinc.
+"""Functions of one variable that are written as sums, products or quotients, known as a whole: silu, gelu, mish,
+soft_sign, sinc, celu, ``x log x``.
 
 Such a function is given with its derivative and with the points at which either of them turns, so range and derivative
 are exact but for rounding. What is left after a slope is taken off is enclosed piece by piece: on each of a few
@@ -11,6 +11,7 @@ the derivative does not depend on it to first order; ulps cover it.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 from gsisio_jax.inclusion.form_arithmetic import product
 from gsisio_jax.inclusion.rules.univariate import INF, Curve, Piece, extremes
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose
+from gsisio_jax.interval.box import Interval, choose, entire_like
 
 PIECES = 8
 
@@ -199,3 +200,44 @@ SOFT_SIGN = Curve(
     Piece(lambda t: 1 / jnp.square(1 + abs(t)), "peak", (0.0, 0.0), 1.0, ulps=16.0),
     lambda s: jax.lax.rsqrt(jnp.maximum(s, 1e-30)) - 1,
 )
+
+
+@functools.cache
+def celu(alpha: float) -> Curve:
+    """``max(t, 0) + alpha expm1(min(t, 0) / alpha)`` for alpha > 0: smooth, and straight from 0 on."""
+    return Curve(
+        Piece(lambda t: jax.nn.celu(t, alpha), "up", (-alpha, INF), ulps=32.0),
+        Piece(lambda t: jnp.exp(jnp.minimum(t, 0) / alpha), "up", (0.0, 1.0), ulps=8.0, drift=_exponent(alpha)),
+        lambda s: alpha * jnp.log(jnp.clip(s, jnp.finfo(s.dtype).tiny, 1)),
+    )
+
+
+def _exponent(alpha: float) -> Callable[[Any], Any]:
+    """What the rounding of ``t / alpha`` does to its exponential; beyond 1100 that is 0."""
+    return lambda t: jnp.minimum(t / alpha, 1100.0)
+
+
+def _x_log_x(t: Any) -> Any:
+    return jnp.where(t > 0, t * jnp.log(jnp.where(t > 0, t, 1)), 0)
+
+
+def _x_log_x_slope(t: Any) -> Any:
+    return jnp.where(t > 0, 1 + jnp.log(jnp.where(t > 0, t, 1)), -INF)
+
+
+@dataclass(frozen=True)
+class Product(Turning):
+    """``t log t``, 0 at 0 and nothing below."""
+
+    def range(self, a: Any, b: Any) -> Interval:
+        return choose(a < 0, entire_like(a), super().range(jnp.maximum(a, 0), jnp.maximum(b, 0)))
+
+    def derivative(self, a: Any, b: Any) -> Interval:
+        return choose(a < 0, entire_like(a), super().derivative(jnp.maximum(a, 0), jnp.maximum(b, 0)))
+
+    def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
+        s, rest = super().line(jnp.maximum(a, 0), jnp.maximum(b, 0), natural)
+        return jnp.where(a < 0, 0, s), choose(a < 0, natural, rest)
+
+
+X_LOG_X = Product(_x_log_x, _x_log_x_slope, (1 / math.e,), (), (0.0, INF), (-INF, INF))

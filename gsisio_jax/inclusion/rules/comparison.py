@@ -19,10 +19,8 @@ from gsisio_jax.inclusion.node import (
     Node,
     as_node,
     best_form,
-    chain,
     is_node,
     jac_of,
-    join,
     meet,
     normalised,
     parts,
@@ -30,15 +28,13 @@ from gsisio_jax.inclusion.node import (
     slope_of,
 )
 from gsisio_jax.inclusion.rules.bilinear import divide, multiply, pick
-from gsisio_jax.inclusion.rules.functions import RELU, SOFTPLUS
+from gsisio_jax.inclusion.rules.functions import RELU
 from gsisio_jax.inclusion.rules.linear import add, negative, structural, subtract
 from gsisio_jax.inclusion.rules.possible import hull_of_cases
 from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, hull
 from gsisio_jax.interval.minmax import larger
-
-LOG_ADD_EXP_ULPS = 512.0
 
 
 def step(outcome: Interval, inputs: Sequence[Any]) -> Node:
@@ -164,37 +160,6 @@ def truncated_remainder(x: Any, y: Any) -> Node:
 def floored_remainder(x: Any, y: Any) -> Node:
     """``jnp.mod``: the sign of the divisor."""
     return _remainder(jnp.floor, x, y)
-
-
-def log_add_exp(x: Any, y: Any) -> Node:
-    """``log(exp x + exp y)``: smooth, so without the kink of the maximum that its body starts from."""
-    if not is_node(x):
-        x, y = y, x
-    x, y = normalised(x), normalised(y) if is_node(y) else as_node(y, x.shape, x.dtype)
-    low, high = x.range.lower, x.range.upper
-    first, last = _log_add_exp(low, y.range.lower), _log_add_exp(high, y.range.upper)
-    # max(x, y) + log1p(exp(-|x - y|)): the sum may cancel, so its error goes with the two terms.
-    natural = Interval.unchecked(
-        rounding.lowered(first, abs(first) + 1, LOG_ADD_EXP_ULPS),
-        rounding.raised(last, abs(last) + 1, LOG_ADD_EXP_ULPS),
-    )
-    bend = apply(SOFTPLUS, subtract(Node(x.range, x.form), Node(y.range, y.form)))
-    total = add(bend, Node(y.range, y.form))
-    form = total.form
-    form = form and best_form(form.slope, form.offset, natural, form.box, form.slack)
-    gap = normalised(subtract(Node(x.range, x.form), Node(y.range, y.form))).range
-    share = SOFTPLUS.derivative(gap.lower, gap.upper)
-    rest = Interval.unchecked(
-        jnp.maximum(rounding.lowered(1 - share.upper, jnp.ones_like(share.upper), 2.0), 0),
-        jnp.minimum(rounding.raised(1 - share.lower, jnp.ones_like(share.lower), 2.0), 1),
-    )
-    return meet(Node(natural, form, join(chain(share, x.jac), chain(rest, y.jac))))
-
-
-def _log_add_exp(x: Any, y: Any) -> Any:
-    plain = jnp.isfinite(x) & jnp.isfinite(y)
-    smooth = jnp.logaddexp(jnp.where(plain, x, 0), jnp.where(plain, y, 0))
-    return jnp.where(plain, smooth, jnp.maximum(x, y))
 
 
 def maximum(x: Any, y: Any) -> Node:

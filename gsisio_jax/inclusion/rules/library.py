@@ -20,11 +20,11 @@ from jax.core import Tracer
 
 from gsisio_jax.inclusion.form_arithmetic import known_if_concrete
 from gsisio_jax.inclusion.node import Node, as_node, is_node, normalised
-from gsisio_jax.inclusion.rules import activations, solving, vectors
+from gsisio_jax.inclusion.rules import activations, factors, solving, vectors
 from gsisio_jax.inclusion.rules.comparison import select, step
 from gsisio_jax.inclusion.rules.functions import CURVES
 from gsisio_jax.inclusion.rules.gates import GATES
-from gsisio_jax.inclusion.rules.linear import add, move, multiple, negative
+from gsisio_jax.inclusion.rules.linear import add, move, multiple, negative, subtract, total
 from gsisio_jax.inclusion.rules.order import count_below
 from gsisio_jax.inclusion.rules.tables import PiecewiseLinear, interpolation
 from gsisio_jax.inclusion.rules.univariate import apply
@@ -32,6 +32,7 @@ from gsisio_jax.interval.box import Interval, choose, entire_like
 
 Rule = Callable[..., list[Any] | None]
 _TABLES: dict[Any, PiecewiseLinear | None] = {}
+_MOST_TABLES = 256  # kept of one process
 
 
 def _concrete(*values: Any) -> bool:
@@ -65,6 +66,8 @@ def _interp(eqn: Any, x: Any, knots: Any, values: Any, *others: Any) -> list[Any
     others = tuple(np.asarray(known_if_concrete(v)) for v in others)
     key = (str(eqn.params["jaxpr"]), knots.tobytes(), values.tobytes(), *(v.tobytes() for v in others))
     if key not in _TABLES:
+        if len(_TABLES) >= _MOST_TABLES:
+            _TABLES.pop(next(iter(_TABLES)))  # the oldest
         _TABLES[key] = interpolation(eqn, knots, values, others)
     table = _TABLES[key]
     if table is None:
@@ -135,13 +138,13 @@ def _square(a: Any) -> int | None:
 
 
 def _det(eqn: Any, a: Node) -> list[Any] | None:
-    return [solving.determinant(a)] if _square(a) else None
+    return [factors.determinant(a)] if _square(a) else None
 
 
 def _slogdet(eqn: Any, a: Node) -> list[Any] | None:
     if not _square(a):
         return None
-    found = normalised(solving.determinant(a))
+    found = normalised(factors.determinant(a))
     sign = jnp.sign(found.range.lower), jnp.sign(found.range.upper)
     jac = found.jac
     if jac is not None:
@@ -174,6 +177,34 @@ def _logit(eqn: Any, x: Node) -> list[Any]:
     return [multiple(2.0, apply(CURVES["atanh"], normalised(moved)))]
 
 
+def _celu(eqn: Any, x: Any, *others: Any) -> list[Any] | None:
+    """With the scale that is its second argument, or in its body."""
+    if not _concrete(*others) or len(others) > 1:
+        return None
+    alpha, sample = float(np.asarray(others[0]) if others else 1.0), _sample(eqn)
+    if np.ndim(others[0] if others else 1.0) or not alpha > 0:
+        return None
+    exact = np.maximum(sample, 0) + alpha * np.expm1(np.minimum(sample, 0) / alpha)
+    return [apply(activations.celu(alpha), x)] if _agree(eqn, _body_at(eqn, sample, *others)[0], exact) else None
+
+
+def _std(eqn: Any, x: Any, *others: Any) -> list[Any] | None:
+    """The standard deviation of all entries: the norm of their differences from the mean, which has no kink but 0."""
+    sample = _sample(eqn)
+    count = sample.size
+    if not _concrete(*others) or not 1 < count <= 64:
+        return None
+    (found,) = _body_at(eqn, sample, *others)
+    for less in (0, 1):
+        if _agree(eqn, found, np.std(sample, ddof=less)):
+            flat = move(lambda v: v.reshape(-1), x)
+            middle = multiple(np.asarray(1 / count, x.dtype), total(flat, [0]), rounded=True)
+            away = subtract(flat, move(lambda v: jnp.broadcast_to(v, (count,)), middle))
+            size = vectors.norm(normalised(away))
+            return [multiple(np.asarray((count - less) ** -0.5, x.dtype), size, rounded=True)]
+    return None
+
+
 WHOLE: dict[str, Rule] = {
     "_interp": _interp,
     "searchsorted": _searchsorted,
@@ -187,7 +218,12 @@ WHOLE: dict[str, Rule] = {
     "mish": _one_of(GATES["mish"]),
     "soft_sign": _one_of((activations.SOFT_SIGN, lambda t: t / (1 + np.abs(t)))),
     "sinc": _one_of((activations.SINC, np.sinc)),
+    "celu": _celu,
+    "_std": _std,
+    "_xlogx": lambda eqn, x: [apply(activations.X_LOG_X, x)],
 }
+# Of these the result is not rounded.
+EXACT = {"searchsorted", "copysign"}
 
 
 # Systems --------------------------------------------------------------------------------------------------------------
@@ -215,7 +251,7 @@ def linear_system(eqn: Any, *args: Any) -> list[Any]:
             if vector.shape[int(turned)] != n:
                 continue
             if _agree(eqn, found, (m @ vector.T).T if turned else m @ vector):
-                a = move(lambda v, transposed=transposed: v.T if transposed else v, a)
+                a = move(lambda v: v.T, a) if transposed else a
                 b = move(lambda v: v.T, b) if turned else b
                 x = solving.solve(a, b)
                 return [move(lambda v: v.T, x) if turned else x]

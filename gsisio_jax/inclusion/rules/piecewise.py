@@ -47,7 +47,7 @@ from gsisio_jax.inclusion.rules.linear import move, subtract
 from gsisio_jax.inclusion.rules.possible import hull_of_cases
 from gsisio_jax.inclusion.rules.switches import Switch, switch_in, switch_of
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, choose, entire_like, intersect
+from gsisio_jax.interval.box import Interval, choose, entire_like, intersect, magnitude
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import times
 
@@ -117,13 +117,16 @@ def _jump(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: 
     thin = Node(Interval.unchecked(cut, cut))
     known = _only_constants(args, pivot)
     with jax.ensure_compile_time_eval() if known else nullcontext():
-        values = [
-            _evaluated(eqn, args, again, switch, thin, value, plain)
-            for value in (switch.at[i], switch.between[i], switch.between[i + 1])
-        ]
-        gaps = [normalised(subtract(values[0], other)).range for other in values[1:]]
-        jumps = [jnp.maximum(abs(gap.lower), abs(gap.upper)) for gap in gaps]
-        size = jnp.maximum(abs(values[0].range.lower), abs(values[0].range.upper))
+        # Mostly the value at the cut is that of a neighbour, and there is no jump to that side.
+        there, *beside = switch.at[i], switch.between[i], switch.between[i + 1]
+        at = _evaluated(eqn, args, again, switch, thin, there, plain)
+        size, jumps = magnitude(at.range), []
+        for value in beside:
+            if value == there:
+                jumps.append(jnp.zeros_like(size))
+            else:
+                other = _evaluated(eqn, args, again, switch, thin, value, plain)
+                jumps.append(magnitude(normalised(subtract(at, other)).range))
         parts_of = [*(jnp.where(jnp.isnan(jump), jnp.inf, jump) for jump in jumps), size]
         return _Jump(*(map(np.asarray, parts_of) if known else parts_of))
 

@@ -22,10 +22,12 @@ from gsisio_jax.inclusion.rules import (
     bilinear,
     comparison,
     convolution,
+    factors,
     functions,
     indexing,
     library,
     linear,
+    log_sums,
     order,
     powers,
     scattering,
@@ -293,10 +295,10 @@ MOVES |= {
     "top_k": order.top_k,
     "argmax": order.argmax,
     "argmin": order.argmin,
-    "lu": lambda eqn, a: solving.lu(a),
-    # Of pivots that say "none" or nothing at all, which are the ones that `solving.lu` makes.
+    "lu": lambda eqn, a: factors.lu(a),
+    # Of pivots that say "none" or nothing at all, which are the ones that `factors.lu` makes.
     "lu_pivots_to_permutation": lambda eqn, pivots: Node(pivots.range, None, pivots.jac),
-    "cholesky": lambda eqn, a: solving.cholesky(a),
+    "cholesky": lambda eqn, a: factors.cholesky(a),
     "triangular_solve": solving.triangular_solve,
     "custom_linear_solve": library.linear_system,
     "debug_callback": lambda eqn, *args: [],
@@ -308,7 +310,8 @@ MOVES |= {
 # Functions of JAX's own libraries whose body loses what the function as a whole keeps. Matched by name, and only where
 # the body comes from JAX itself.
 LIBRARY: dict[str, Rule] = {
-    "logaddexp": _plain(comparison.log_add_exp),
+    "logaddexp": _plain(log_sums.log_add_exp),
+    "logaddexp2": _plain(log_sums.log_add_exp2),
     "remainder": _plain(comparison.floored_remainder),
     "floor_divide": lambda eqn, x, y: comparison.staircase(jnp.floor, -1.0, 0.0)(bilinear.divide(x, y)),
     "trunc": _plain(comparison.truncate),

@@ -1,23 +1,20 @@
-"""Linear algebra of small matrices whose entries depend on the box: systems, determinants, factors.
+"""Linear systems of small matrices whose entries depend on the box.
 
-**Systems.** With C near the inverse of A at its center and any vector x~, the solution of ``A x = b`` is
+With C near the inverse of A at its center and any vector x~, the solution of ``A x = b`` is
 
     x = x~ + y,    y = C r + E y,    r = b - A x~,    E = I - C A.
 
 r is linear in A and b, so C r keeps slopes, while ``E y`` is of second order in the widths and goes to the offset. A
 vector u > 0 with ``|E| u + |C r| <= u`` and, strictly, ``|E| u < u`` proves that every A of the enclosure is regular
 (the spectral radius of E is below 1) and that ``|y| <= u``; one is computed to nearest and then checked, rounded
-outward. Without one nothing is known of x: the bounds are infinite. Derivatives solve the same system,
-``dx = A^-1 (db - dA x)``. C and x~ are numbers like any others: how well they are known makes no difference to what is
-proved. A matrix that does not depend on the box is inverted in fractions.
-
-**Determinants** are expanded by rows over all minors of the last columns; **factors** are eliminated entry by entry,
-without exchange of rows: what does not hold for all matrices of the enclosure is not known.
+outward. Without one nothing is known of x: the bounds are infinite. Derivatives are ``A^-1 (db - dA x)``, with an
+inverse that is the solution for the unit vectors, and with what `tangents` knows of dA and db. C and x~ are numbers
+like any others: how well they are known makes no difference to what is proved. A matrix that does not depend on the box
+is inverted in fractions.
 """
 
 from __future__ import annotations
 
-import itertools
 from fractions import Fraction
 from typing import Any
 
@@ -27,29 +24,26 @@ import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import box_sum, is_known, product
 from gsisio_jax.inclusion.node import Node, as_node, is_node, jac_of, meet, normalised, parts
-from gsisio_jax.inclusion.rules.bilinear import divide, multiply
-from gsisio_jax.inclusion.rules.functions import CURVES, SQUARE
+from gsisio_jax.inclusion.rules.bilinear import multiply
 from gsisio_jax.inclusion.rules.linear import add, move, multiple, structural, subtract, total
 from gsisio_jax.inclusion.rules.possible import formless, unknown
-from gsisio_jax.inclusion.rules.univariate import apply
+from gsisio_jax.inclusion.rules.tangents import Tangents
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, magnitude
 
 MOST_ROWS = 12
 
 
-# Systems --------------------------------------------------------------------------------------------------------------
 def solve(a: Any, b: Any) -> Any:
     """Solution of ``a x = b``; a (n, n), b (n,) or (n, m), nodes or constants, one of them a node."""
     if not is_node(a):
         if is_known(a):
             return _solve_known(a, b)
         a = as_node(a, np.shape(a), b.dtype)
-    a = normalised(a)
     columns = len(_shape(b)) == 2
-    b = normalised(b) if is_node(b) else as_node(b, np.shape(b), a.dtype)
-    b = b if columns else move(lambda v: v[:, None], b)
-    x = _solve_columns(a, b)
+    b = b if is_node(b) else as_node(b, np.shape(b), a.dtype)
+    right = b if columns else move(lambda v: v[:, None], b)
+    x = _solve_columns(normalised(a), normalised(right), (a, b))
     return x if columns else move(lambda v: v[:, 0], x)
 
 
@@ -74,26 +68,31 @@ def _image(a: Interval, b: Interval) -> Interval:
     return Interval.unchecked(rounding.sum_down(terms.lower, -2), rounding.sum_up(terms.upper, -2))
 
 
-def _solve_columns(a: Node, b: Node) -> Node:
-    n = a.shape[0]
+def _solve_columns(a: Node, b: Node, sources: tuple[Node, Node]) -> Node:
+    """`sources` are a and b as they came, with their origins."""
     c = _inverse(a.range.center)
-    x = _clean(c @ _clean(b.range.center))
+    _, jac = parts([a, b])
     # E = I - C A; the bounds of its entries are all that is used of it.
-    eye = np.eye(n, dtype=a.dtype)
-    error = normalised(subtract(eye, _times(c, formless(a)))).range
-    small = magnitude(error)
-    residual = subtract(b, _times(a, x))
-    start = normalised(_times(c, formless(residual)))
-    reached = magnitude(start.range)
-    u, proved = _fixed_radius(small, reached)
-    spread = Interval.unchecked(-u, u)
-    left = _image(error, spread)
-    y = box_sum(start.range, left)
+    error = normalised(subtract(np.eye(a.shape[0], dtype=a.dtype), _times(c, formless(a)))).range
+    if jac is None:
+        return _enclosed(a, b, c, error)
+    # The inverse is the solution for the unit vectors.
+    m, eye = b.shape[1], as_node(np.eye(a.shape[0]), a.shape, a.dtype)
+    right = structural(lambda *v: jnp.concatenate(v, 1), [formless(b), eye])[0]
+    every = _enclosed(formless(a), right, c, error)
+    x, inverse = (move(lambda v, part=part: v[:, part], every) for part in (slice(None, m), slice(m, None)))
+    return Node(x.range, x.form, _derivative(*sources, normalised(x), normalised(inverse)))
+
+
+def _enclosed(a: Node, b: Node, c: Any, error: Interval) -> Node:
+    """The solution with its form, without a Jacobian; see the module docstring."""
+    x = _clean(c @ _clean(b.range.center))
+    start = normalised(_times(c, formless(subtract(b, _times(a, x)))))
+    u, proved = _fixed_radius(magnitude(error), magnitude(start.range))
+    y = box_sum(start.range, _image(error, Interval.unchecked(-u, u)))
     y = Interval.unchecked(jnp.maximum(y.lower, -u), jnp.minimum(y.upper, u))
-    left = _image(error, y)
-    moved = add(add(start, Node(left)), _as_rest(x, a.dtype))
-    natural = choose(proved, normalised(moved).range, entire_like(y))
-    form = normalised(moved).form
+    moved = normalised(add(add(start, Node(_image(error, y))), as_node(x, x.shape, a.dtype)))
+    natural, form = choose(proved, moved.range, entire_like(y)), moved.form
     if form is not None:
         form = type(form)(
             jnp.where(proved, form.slope, 0),
@@ -101,37 +100,31 @@ def _solve_columns(a: Node, b: Node) -> Node:
             form.box,
             None if form.slack is None else jnp.where(proved, form.slack, 0),
         )
-    _, jac = parts([a, b])
-    if jac is not None:
-        jac = _derivative(a, b, c, error, small, natural)
-    return meet(Node(natural, form, jac))
+    return meet(Node(natural, form))
 
 
-def _as_rest(x: Any, dtype: Any) -> Node:
-    return Node(Interval.unchecked(x.astype(dtype), x.astype(dtype)))
-
-
-def _derivative(a: Node, b: Node, c: Any, error: Interval, small: Any, x: Interval) -> Interval:
-    """``dx = C (db - dA x) + E dx`` for every entry of the box: (size, n, m)."""
+def _derivative(a: Node, b: Node, x: Node, inverse: Node) -> Interval:
+    """``A^-1 (db - dA x)`` for every entry of the box: (size, n, m), from products of forms: what x and the inverse
+    have in common is not lost."""
     size = next(v.jac.lower.shape[0] for v in (a, b) if v.jac is not None)
     ja, jb = jac_of(a, size), jac_of(b, size)
-    right = box_sum(jb, _flip(_image(ja, x)))
-    wide = Interval.unchecked(*(jnp.broadcast_to(side, (size, *side.shape)) for side in (c, c)))
-    start = _image(wide, right)
-    u, proved = _fixed_radius(small, magnitude(start))
-    spread = Interval.unchecked(-u, u)
-    every = Interval.unchecked(*(jnp.broadcast_to(side, (size, *side.shape)) for side in (error.lower, error.upper)))
-    found = box_sum(start, _image(every, spread))
-    found = Interval.unchecked(jnp.maximum(found.lower, -u), jnp.minimum(found.upper, u))
-    found = box_sum(start, _image(every, found))
-    found = choose(proved, found, entire_like(found))
+    tangent = Tangents(size)
+    moved = move(lambda v: v.reshape(size, *x.shape), tangent(b))
+    right = subtract(moved, _products(normalised(tangent(a)), x))
+    found = normalised(_products(inverse, normalised(right))).range
     # An entry of the box on which neither side depends.
-    still = ((right.lower == 0) & (right.upper == 0)).all((-2, -1), keepdims=True)
-    return choose(still & proved, Interval.unchecked(0.0, 0.0), found)
+    flat = [((side.lower == 0) & (side.upper == 0)).reshape(size, -1).all(1) for side in (ja, jb)]
+    still = (flat[0] & flat[1])[:, None, None]
+    return choose(still & jnp.isfinite(inverse.range.lower).all(), Interval.unchecked(0.0, 0.0), found)
 
 
-def _flip(a: Interval) -> Interval:
-    return Interval.unchecked(-a.upper, -a.lower)
+def _products(a: Node, b: Node) -> Node:
+    """Matrix products (..., n, k) (..., k, m), of which one has an axis before."""
+    (n, k), m = a.shape[-2:], b.shape[-1]
+    shape = (*(a.shape[:-2] or b.shape[:-2]), n, k, m)
+    wide_a = move(lambda v: jnp.broadcast_to(v[..., None], shape), a)
+    wide_b = move(lambda v: jnp.broadcast_to(v[..., None, :, :], shape), b)
+    return total(multiply(wide_a, wide_b), [len(shape) - 2])
 
 
 def _fixed_radius(small: Any, reached: Any) -> tuple[Any, Any]:
@@ -209,79 +202,6 @@ def _exact_inverse(a: np.ndarray) -> np.ndarray | None:
                 factor = rows[i][k]
                 rows[i] = [v - factor * w for v, w in zip(rows[i], rows[k], strict=True)]
     return np.array([[float(v) for v in row[n:]] for row in rows])
-
-
-# Determinants ---------------------------------------------------------------------------------------------------------
-def determinant(a: Node) -> Node:
-    """Of a node (n, n), over the minors of its first k rows: n products of arrays."""
-    n = a.shape[0]
-    minors = move(lambda v: v[0], a)  # of row 0 and column j
-    before: list[tuple[int, ...]] = [(j,) for j in range(n)]
-    for k in range(1, n):
-        sets = list(itertools.combinations(range(n), k + 1))
-        columns = np.array(sets)
-        rest = np.array([[before.index(s[:i] + s[i + 1 :]) for i in range(k + 1)] for s in sets])
-        signs = np.array([(-1.0) ** (k - i) for i in range(k + 1)])
-        row = move(lambda v, k=k, columns=columns: v[k][columns], a)
-        below = move(lambda v, rest=rest: v[rest], minors)
-        signed = multiple(np.broadcast_to(signs, rest.shape), below)
-        minors, before = total(multiply(row, signed), [1]), sets
-    return move(lambda v: v[0], minors)
-
-
-# Factors --------------------------------------------------------------------------------------------------------------
-def _entries(a: Node) -> list[list[Any]]:
-    n, m = a.shape
-    return [[move(lambda v, i=i, j=j: v[i, j], a) for j in range(m)] for i in range(n)]
-
-
-def _matrix(rows: list[list[Any]]) -> Node:
-    flat = [v for row in rows for v in row]
-    shape = (len(rows), len(rows[0]))
-    return structural(lambda *v: jnp.stack(v).reshape(shape), flat)[0]
-
-
-def cholesky(a: Node) -> Node:
-    """The lower factor L of ``a = L L'``; only the lower triangle of a is looked at."""
-    n, entries = a.shape[0], _entries(normalised(a))
-    zero = np.zeros((), a.dtype)
-    factor: list[list[Any]] = [[zero] * n for _ in range(n)]
-    for j in range(n):
-        rest = entries[j][j]
-        for k in range(j):
-            rest = subtract(rest, apply(SQUARE, factor[j][k]))
-        factor[j][j] = apply(CURVES["sqrt"], normalised(rest))
-        for i in range(j + 1, n):
-            rest = entries[i][j]
-            for k in range(j):
-                rest = subtract(rest, multiply(factor[i][k], factor[j][k]))
-            factor[i][j] = normalised(divide(normalised(rest), factor[j][j]))
-    return _matrix(factor)
-
-
-def lu(a: Node) -> list[Node]:
-    """Factors, pivots and permutation, as long as no row needs to be exchanged; else nothing is known of them."""
-    n, rows = a.shape[0], _entries(normalised(a))
-    certain = jnp.ones((), bool)
-    for k in range(n):
-        pivot = normalised(rows[k][k]).range
-        least = jnp.where((pivot.lower <= 0) & (pivot.upper >= 0), 0, jnp.minimum(abs(pivot.lower), abs(pivot.upper)))
-        certain &= least > 0
-        for i in range(k + 1, n):
-            certain &= magnitude(normalised(rows[i][k]).range) < least
-            rows[i][k] = normalised(divide(rows[i][k], rows[k][k]))
-            for j in range(k + 1, n):
-                rows[i][j] = normalised(subtract(rows[i][j], multiply(rows[i][k], rows[k][j])))
-    factors = _matrix(rows)
-    nothing = unknown(a.shape, a.dtype, [a])
-    found = structural(lambda p, q: jnp.where(certain, p, q), [factors, nothing], [certain])[0]
-    places = np.arange(n, dtype=float)
-    order = Interval.unchecked(jnp.where(certain, places, 0), jnp.where(certain, places, n - 1.0))
-    jac = None
-    if a.jac is not None:
-        flat = jnp.zeros((a.jac.lower.shape[0], n))
-        jac = choose(certain, Interval.unchecked(flat, flat), entire_like(flat))
-    return [found, Node(order, None, jac), Node(order, None, jac)]
 
 
 def triangular_solve(eqn: Any, a: Any, b: Any) -> Any:

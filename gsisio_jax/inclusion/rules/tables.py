@@ -103,11 +103,12 @@ class PiecewiseLinear:
     def _points(self, a: Any, b: Any, s: Any) -> tuple[Any, Any, Any]:
         """``phi - s t`` at every knot, which of them lie between a and b, and what the error goes with."""
         knots, values = self.knots, self.values
-        inside = (a[..., None] <= knots) & (knots <= b[..., None])
+        inside = met = (a[..., None] <= knots) & (knots <= b[..., None])
+        reaches = a < self.knots[0], b > self.knots[-1]
         for k, jump in zip((0, -1), self.jumps, strict=True):
             if jump:
                 # The limit from outside, where that is part of the interval.
-                beyond = inside[..., k] & ((a if k == 0 else -b) < (knots[0] if k == 0 else -knots[-1]))
+                beyond = met[..., k] & reaches[k]
                 inside = jnp.concatenate([inside, beyond[..., None]], -1)
                 knots, values = np.append(knots, self.knots[k]), np.append(values, self.beyond[k])
         if s is None:
@@ -180,8 +181,12 @@ class PiecewiseLinear:
         s = jnp.where(both, s, jnp.where(low, self.tails[1], self.tails[0])).astype(a.dtype)
         usable = jnp.isfinite(s) & (low | high | (self.tails[0] == self.tails[1]))
         s = jnp.where(usable, s, 0)
-        # An infinite end adds nothing that the last knot has not: there the rest does not change any more.
-        far = (jnp.where(low, a, jnp.minimum(self.knots[0], b)), jnp.where(high, b, jnp.maximum(self.knots[-1], a)))
+        # An infinite end adds nothing that the last knot has not, or a point beyond it where the function jumps there:
+        # further out the rest does not change any more.
+        first, last = (
+            knot + side * jump for knot, side, jump in zip(self.knots[[0, -1]], (-1, 1), self.jumps, strict=True)
+        )
+        far = (jnp.where(low, a, jnp.minimum(first, b)), jnp.where(high, b, jnp.maximum(last, a)))
         rest = self._extremes(*far, s)
         for end, k in ((low, 0), (high, 1)):
             # The tail's slope is that of a segment, to within its rounding: times infinity, that is no bound.

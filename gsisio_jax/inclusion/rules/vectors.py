@@ -194,12 +194,13 @@ def softmax(a: Node) -> Node:
     )
     top = jnp.where((p.lower <= 0.5) & (p.upper >= 0.5), 0.25, jnp.maximum(*ends[1]))
     own = Interval.unchecked(jnp.maximum(jnp.minimum(*ends[0]), 0), top)
-    # -p_i p_j with p_i + p_j <= 1.
-    both = p.upper[:, None] * p.upper[None]
+    # -p_i p_j with p_i + p_j <= 1, so neither exceeds what it is of its own; of two entries it is that.
     other = Interval.unchecked(
-        jnp.maximum(rounding.down(-both, 4.0), -0.25),
+        jnp.maximum(rounding.down(-p.upper[:, None] * p.upper[None], 4.0), -jnp.minimum(top[:, None], top[None])),
         jnp.minimum(rounding.up(-p.lower[:, None] * p.lower[None], 4.0), 0),
     )
+    if a.shape[0] == 2:
+        other = Interval.unchecked(other.lower, -jnp.maximum(own.lower[:, None], own.lower[None]))
     same = jnp.eye(a.shape[0], dtype=bool).reshape(a.shape[0], a.shape[0], *(1,) * (len(a.shape) - 1))
     derivative = choose(same, Interval.unchecked(own.lower[None], own.upper[None]), other)
     return composed(_each(a), p, derivative, at)
