@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -12,6 +11,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from .errors import UserError, reason
 from .fields import Bounds, FileName, Number, Part, Reference, SignalName, check_box
+from .logs.config import TablePart
 from .study_config import MonteCarloPart, SweepPart
 
 
@@ -73,18 +73,6 @@ class DesignPart(Part):
     form: Literal["current", "prediction"] | None = None
     left_inverse: Literal["pseudo", "feedthrough", "smallest"] | None = None
     allow_uncertified: bool | None = None
-
-
-class TablePart(Part):
-    """The logged measurements."""
-
-    file: str
-    time: str
-    sample_time: Annotated[Number, Field(gt=0, lt=math.inf)]
-    y: Annotated[list[str], Field(min_length=1)]
-    u: list[str] = Field(default_factory=list)
-    missing: list[float | int | str] = Field(default_factory=list)
-    transform: Reference | None = None
 
 
 class EstimatePart(Part):

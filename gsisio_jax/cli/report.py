@@ -11,9 +11,9 @@ from typing import IO, Any
 import numpy as np
 
 from ..observer.status import Status
+from .logs import Table
 from .problem import Problem
 from .run import Outcome
-from .table import Table
 
 SHOWN_TIMES = 8
 SHOWN_ALARMS = 20
@@ -46,6 +46,7 @@ def summarise(
     unbounded = int(np.count_nonzero(status & int(Status.UNBOUNDED)))
     facts = [
         ("steps", f"{steps}, from {table.time[0]:.10g} s to {table.time[-1]:.10g} s"),
+        *table.notes,
         ("missing rows", f"{whole}" + (f", and {partly} with some entries missing" if partly else "")),
         ("conflicts", _conflicts(table.time[conflicts])),
         ("unbounded", f"{unbounded} steps with a state that is not bounded"),

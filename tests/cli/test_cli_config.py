@@ -5,12 +5,20 @@ from __future__ import annotations
 import pytest
 
 CASES = {
-    "unknown key": ('time = "t"', 'tiem = "t"', ["cart.toml: ", "table.time is missing", "1 more problem"]),
+    "unknown key": ('time = "t"', 'tiem = "t"', ["cart.toml: unknown key table.tiem; did you mean time?"]),
     "misspelt key": ('missing = [-9999, "n/a"]', "mising = []", ["unknown key table.mising", "did you mean missing?"]),
     "unknown section": ("[outputs]", "[pictures]", ["unknown key pictures", "keys here are", "outputs"]),
     "signal key": ('name = "force", unit', 'name = "force", units', ["signals.input[0].units", "did you mean unit?"]),
-    "wrong type": ("sample_time = 0.1", 'sample_time = "0.1"', ["table.sample_time must be a valid number", "'0.1'"]),
-    "sample time": ("sample_time = 0.1", "sample_time = 0", ["table.sample_time must be greater than 0"]),
+    "wrong type": (
+        "sample_time = 0.1",
+        'sample_time = "0.1"',
+        ["table.sample_time: must be a number", "'0.1'"],
+    ),
+    "sample time": (
+        "sample_time = 0.1",
+        "sample_time = 0",
+        ['table.sample_time: must be a number of seconds greater than 0, or "auto"; got 0'],
+    ),
     "reference": ("cart_model:cart", "cart_model.cart", ['system.use: must read "module:attribute"']),
     "module": ("cart_model:cart", "no_such_module:cart", ["system.use: cannot import no_such_module"]),
     "attribute": ("cart_model:cart", "cart_model:card", ["system.use: cart_model has no attribute card"]),

@@ -1,11 +1,11 @@
 """From seconds to indices of an evenly spaced grid, block by block.
 
-The index goes from row to row: a row lies n steps after the one before, n being the time between them in sample times,
-rounded. Counting from the first row instead would add up the rounding of a sample time that was written with a few digits
-(0.0333 for 1/30 is a whole step off after a thousand rows). Where every stamp is within a tolerance of less than a quarter
-of a step from the true grid, a difference of two is within half a step of its true value, so every n is exact and errors
-cannot add up. Across a gap of many steps a rounded sample time would count wrongly again; there, the mean time between
-neighbouring rows takes its place as soon as the two differ by more than the jitter explains.
+The index goes from row to row: a row lies n steps after the one before, n being the time between them in sample
+times, rounded. Counting from the first row instead would add up the rounding of a sample time that was written with a
+few digits (0.0333 for 1/30 is a whole step off after a thousand rows). Where every stamp is within a tolerance of less
+than a quarter of a step from the true grid, a difference of two is within half a step of its true value, so every n is
+exact and errors cannot add up. Across a gap of many steps a rounded sample time would count wrongly again; there, the
+mean time between neighbouring rows takes its place as soon as the two differ by more than the jitter explains.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class Clock:
             (R,) int64, not falling; 0 is the point of the first row.
 
         Raises:
-            UserError: a stamp falls behind the one before, is there twice, or is off the grid; most of the grid would be
-                empty; the mean time between rows is not the sample time.
+            UserError: a stamp falls behind the one before, is there twice, or is off the grid; the clock has another
+                unit than the sample time; the mean time between rows is not the sample time.
         """
         since = stamps.since
         if not len(since):
@@ -82,14 +82,15 @@ class Clock:
         if not duplicates and shared.any():
             bad = int(np.argmax(shared)) + first
             raise UserError(
-                f"{stamps.place(bad)}: the times {self._before(stamps, bad)} and {stamps.show(bad)} fall on the same step "
-                f'of sample_time = {self.sample_time:g} s; set on_duplicate = "first", "last" or "mean", or mend sample_time'
+                f"{stamps.place(bad)}: the times {self._before(stamps, bad)} and {stamps.show(bad)} fall on the same "
+                f'step of sample_time = {self.sample_time:g} s; set on_duplicate = "first", "last" or "mean", or '
+                "mend sample_time"
             )
         index = self.index + np.cumsum(count)
         if index[-1] > MAXIMUM_STEPS:
             raise UserError(
-                f"{stamps.place(len(stamps) - 1)}: the times span {since[-1]:.6g} s, more than {MAXIMUM_STEPS} steps of "
-                f"{self.sample_time:g} s; check time.unit and sample_time"
+                f"{stamps.place(len(stamps) - 1)}: the times span {since[-1]:.6g} s, more than {MAXIMUM_STEPS} steps "
+                f"of {self.sample_time:g} s; check time.unit and sample_time"
             )
         index = index.astype(np.int64)
         self._no_drift(stamps, index, since, slack, error)
@@ -111,15 +112,17 @@ class Clock:
             return
         raise UserError(
             f"{name}: {points - self.rows:,} of the {points:,} steps of sample_time = {self.sample_time:g} s would be "
-            f"without a row; the times differ by {self.usual:.6g} s a row. Set sample_time = {self.usual:.6g}, or sparse = "
-            "true where rows are meant to be rare"
+            f"without a row; the times differ by {self.usual:.6g} s a row. Set sample_time = {self.usual:.6g}, or "
+            "sparse = true where rows are meant to be rare"
         )
 
     def describe(self) -> str:
         """What was found, in one line."""
         absent = self.index + 1 - self.rows
         how = "found sample_time = " if self.found else "sample_time = "
-        gaps = f"{self.gaps} gap{'s' if self.gaps != 1 else ''}" + (f" ({absent:,} steps without a row)" if absent else "")
+        gaps = f"{self.gaps} gap{'s' if self.gaps != 1 else ''}" + (
+            f" ({absent:,} steps without a row)" if absent else ""
+        )
         share = f"{self.rows:,} rows on {self.index + 1:,} steps ({100 * self.rows / (self.index + 1):.4g} %)"
         return f"{how}{self.sample_time:.9g} s: {share}, {gaps}, largest jitter {self.jitter:.2g} s"
 
@@ -144,7 +147,7 @@ class Clock:
         )
 
     def _period(self, step: np.ndarray) -> tuple[float, float]:
-        """Seconds of a step, and how far it may be wrong: the sample time, or the mean of rows where that is surely off."""
+        """Seconds of a step (the mean of neighbours where that surely differs), and how far such a mean may be off."""
         count = np.rint(step / self.sample_time)
         near = (count > 0) & (count <= NEAR)
         self.near_time += float(step[near].sum())
@@ -165,10 +168,10 @@ class Clock:
     def _off(self, stamps: Stamps, bad: int) -> None:
         between = stamps.since[bad] - (stamps.since[bad - 1] if bad else self.since)
         raise UserError(
-            f"{stamps.place(bad)}: the time {stamps.show(bad)} is not on the grid of sample_time = {self.sample_time:.9g} s: "
-            f"it comes {between:.6g} s after {self._before(stamps, bad)}, {between / self.sample_time:.4g} steps, and "
-            f"each may be off by {self.tolerance:.3g} s (time.tolerance); rows that lie on no grid need "
-            'dt = "as_input"'
+            f"{stamps.place(bad)}: the time {stamps.show(bad)} is not on the grid of sample_time = "
+            f"{self.sample_time:.9g} s: it comes {between:.6g} s ({between / self.sample_time:.4g} steps) after "
+            f"{self._before(stamps, bad)}, and each may be off by {self.tolerance:.3g} s (time.tolerance); rows that "
+            'lie on no grid need dt = "as_input"'
         )
 
     def _no_drift(self, stamps: Stamps, index: np.ndarray, since: np.ndarray, slack: float, error: float) -> None:
@@ -177,9 +180,10 @@ class Clock:
         if wrong.any():
             bad = int(np.argmax(wrong))
             mean = since[-1] / index[-1] if index[-1] else math.inf
+            here = since[bad] / max(index[bad], 1)
             raise UserError(
-                f"{stamps.place(bad)}: up to here the rows are {since[bad] / max(index[bad], 1):.6g} s apart on average, not "
-                f"sample_time = {self.sample_time:.9g} s; set sample_time = {rounded(mean, error):.9g}, or \"auto\""
+                f"{stamps.place(bad)}: up to here the rows are {here:.6g} s apart on average, "
+                f'not sample_time = {self.sample_time:.9g} s; set sample_time = {rounded(mean, error):.9g}, or "auto"'
             )
 
 
@@ -233,8 +237,9 @@ def find_sample_time(stamps: Stamps) -> float:
     good = (deviation <= 0.2 * mean) & (np.rint(step / mean) > 0)
     if good.mean() < 0.9:
         raise UserError(
-            f"{stamps.place(0)}: sample_time = \"auto\" found steps of about {float(np.median(step)):.4g} s, but only "
-            f"{good.mean():.0%} of the rows lie on such a grid; give sample_time, or dt = \"as_input\" where rows are uneven"
+            f'{stamps.place(0)}: sample_time = "auto" found steps of about {float(np.median(step)):.4g} s, but only '
+            f"{good.mean():.0%} of the rows lie on such a grid; give sample_time, or "
+            'dt = "as_input" where rows are uneven'
         )
     runs = 1 + int(np.count_nonzero(~near))
     jitter = float(deviation[good].max())

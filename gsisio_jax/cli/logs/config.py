@@ -165,8 +165,8 @@ class TablePart(Part):
             raise ValueError('time.tolerance has no meaning with dt = "as_input": its rows lie on no grid')
         if tolerance is not None and isinstance(self.sample_time, float) and tolerance > self.sample_time / 4:
             raise ValueError(
-                f"time.tolerance = {tolerance:g} s must not exceed a quarter of sample_time ({self.sample_time / 4:g} s): "
-                "beyond that a row could belong to either neighbour"
+                f"time.tolerance = {tolerance:g} s must not exceed a quarter of sample_time "
+                f"({self.sample_time / 4:g} s): beyond that a row could belong to either neighbour"
             )
         for name in self.columns:
             if name not in (*self.y, *self.u):

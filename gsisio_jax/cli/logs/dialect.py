@@ -121,7 +121,11 @@ def sniff(
         "decimal comma" if decimal == "," else "",
         f"thousands as in 1{thousands}000" if thousands else "",
         f"comments after {comment}" if comment else "",
-        f"header in line {layout.header}" if layout.header > 1 else "" if layout.header else "no header: columns c1, c2, ...",
+        f"header in line {layout.header}"
+        if layout.header > 1
+        else ""
+        if layout.header
+        else "no header: columns c1, c2, ...",
         f"{units} line{'s' if units > 1 else ''} of units" if units else "",
         "" if encoding in ("utf-8", "utf-8-sig") else encoding,
         "" if compression == "none" else compression,
@@ -222,8 +226,10 @@ def _unit_rows(rows: list[list[str]], layout: _Layout, wanted: Sequence[str], mi
 
     def speaks(cells: list[str]) -> bool:
         looked = [cells[index] for index in chosen if index < len(cells)]
-        return any(looked) and not any(cell[:1].isdigit() or numerals.is_number(cell) for cell in looked) and not any(
-            cell and cell.lower() in words for cell in looked
+        return (
+            any(looked)
+            and not any(cell[:1].isdigit() or numerals.is_number(cell) for cell in looked)
+            and not any(cell and cell.lower() in words for cell in looked)
         )
 
     count = next((index for index, cells in enumerate(rows[:3]) if not speaks(cells)), min(len(rows), 3))

@@ -6,7 +6,23 @@ import re
 from collections.abc import Iterable
 
 MISSING = frozenset(
-    {"", "nan", "-nan", "+nan", "na", "n/a", "#n/a", "#na", "<na>", "null", "none", "nat", "1.#qnan", "1.#ind", "-1.#ind"}
+    {
+        "",
+        "nan",
+        "-nan",
+        "+nan",
+        "na",
+        "n/a",
+        "#n/a",
+        "#na",
+        "<na>",
+        "null",
+        "none",
+        "nat",
+        "1.#qnan",
+        "1.#ind",
+        "-1.#ind",
+    }
 )
 _EXPONENT = r"([eE][+-]?\d+)?"
 _PLAIN = re.compile(rf"[+-]?(\d+\.?\d*|\.\d+){_EXPONENT}|[+-]?inf(inity)?", re.IGNORECASE)
@@ -54,7 +70,9 @@ def find(cells: Iterable[str], separator: str, decimal: str | None, thousands: s
     commas = [cell for cell in cells if _COMMA.fullmatch(cell)]
     if thousands is None:
         for mark, other in ((",", "."), (".", ",")):
-            both = [c for c in cells if mark in c and other in c and _THOUSANDS[mark].fullmatch(c) and c.count(other) == 1]
+            both = [
+                c for c in cells if mark in c and other in c and _THOUSANDS[mark].fullmatch(c) and c.count(other) == 1
+            ]
             repeated = [c for c in cells if c.count(mark) > 1 and _THOUSANDS[mark].fullmatch(c)]
             if (both or repeated) and decimal in (None, other):
                 return other, mark
@@ -66,9 +84,8 @@ def find(cells: Iterable[str], separator: str, decimal: str | None, thousands: s
         certain = [cell for cell in commas if not _THOUSANDS[","].fullmatch(cell) or re.match(r"[+-]?0", cell)]
         if commas and not points and not certain and thousands is None:
             example = min(commas)
-            raise ValueError(
-                f"'{example}' may mean {example.replace(',', '.')} or {example.replace(',', '')}, and no cell says which"
-            )
+            as_decimal, as_thousands = example.replace(",", "."), example.replace(",", "")
+            raise ValueError(f"'{example}' may mean {as_decimal} or {as_thousands}, and no cell says which")
         if commas and points and not certain and thousands is None:
             thousands = ","
     return decimal, thousands or ""

@@ -133,13 +133,15 @@ class StampReader:
         else:
             text = series.astype(object).where(~empty, "").map(lambda cell: str(cell).strip())
             words = {word for word in self.missing if isinstance(word, str)}
-            empty = text.map(lambda cell: cell in words or cell.lower() in ("", "nan", "nat", "null", "na", "n/a")).to_numpy(
-                dtype=bool
-            )
+            empty = text.map(
+                lambda cell: cell in words or cell.lower() in ("", "nan", "nat", "null", "na", "n/a")
+            ).to_numpy(dtype=bool)
             found, aware = self._parsed(text, empty, place, pandas)
         if not aware:
             found = self._in_zone(found, empty, place)
-        nanoseconds = found.dt.tz_convert("UTC").dt.tz_localize(None).astype("datetime64[ns]").to_numpy().astype(np.int64)
+        nanoseconds = (
+            found.dt.tz_convert("UTC").dt.tz_localize(None).astype("datetime64[ns]").to_numpy().astype(np.int64)
+        )
         return nanoseconds, empty
 
     def _parsed(self, text: Any, empty: np.ndarray, place: Callable[[int], str], pandas: Any) -> tuple[Any, bool]:
@@ -157,7 +159,7 @@ class StampReader:
         try:
             found = pandas.to_datetime(cells, format=pattern or "ISO8601", errors="coerce", utc=aware)
         except ValueError as error:
-            raise UserError(f"time.format = \"{pattern}\" is no pattern of dates: {error}") from error
+            raise UserError(f'time.format = "{pattern}" is no pattern of dates: {error}') from error
         wrong = found.isna().to_numpy(dtype=bool) & ~empty
         if wrong.any():
             bad = int(np.argmax(wrong))
@@ -173,8 +175,8 @@ class StampReader:
         if lost.any():
             bad = int(np.argmax(lost))
             raise UserError(
-                f"{place(bad)}: the local time {found[bad]} is there twice or not at all in {zone}, where clocks are set "
-                "that night; log in UTC or with an offset such as +02:00"
+                f"{place(bad)}: the local time {found[bad]} is there twice or not at all in {zone}, where clocks "
+                "are set that night; log in UTC or with an offset such as +02:00"
             )
         return local
 
@@ -214,7 +216,9 @@ def _epoch_unit(value: float, place: str) -> str:
         # From 1989 to 2128: no two units share a number.
         if 6e8 <= abs(value) / PER_SECOND[unit] <= 5e9:
             return unit
-    raise UserError(f"{place}: {value:.17g} is no time since 1970 in s, ms, us or ns; set time.unit to the clock's own unit")
+    raise UserError(
+        f"{place}: {value:.17g} is no time since 1970 in s, ms, us or ns; set time.unit to the clock's own unit"
+    )
 
 
 def _text(cell: Any) -> str:

@@ -10,10 +10,11 @@ import numpy as np
 
 from ..._extras import need
 from ..errors import UserError, reason
-from .cells import Block, Cells, Parser, check_columns
+from .cells import Block, Cells, check_columns
 from .config import TablePart
 from .dialect import Dialect
 from .parquet import parquet_frame
+from .parser import Parser
 from .text import blocks_of_lines, opened
 
 
@@ -26,8 +27,8 @@ def transformed(
         path: the file.
         dialect: of a text file; None for Parquet.
         part: the table ``[table]`` of the configuration.
-        transform: gets columns of numbers as floats with NaN where missing, other columns as they are; its result counts
-            its rows from 1.
+        transform: gets columns of numbers as floats with NaN where missing, other columns as they are; its result
+            counts its rows from 1.
 
     Raises:
         UserError: the file cannot be read, or the function fails or returns something else.
