@@ -72,7 +72,7 @@ class Clock:
         first = 0 if self.rows else 1  # the very first row has none before it
         check_order(stamps, step, self.shown, duplicates, self.rows > 0)
         self._plausible(stamps, step[first:])
-        period, error = self._period(step[first:])
+        period = self._period(step[first:])
         count = np.rint(step / period)
         slack = self._slack(stamps)
         off = np.abs(step - count * period) > slack
@@ -93,7 +93,7 @@ class Clock:
                 f"of {self.sample_time:g} s; check time.unit and sample_time"
             )
         index = index.astype(np.int64)
-        self._no_drift(stamps, index, since, slack, error)
+        self._no_drift(stamps, index, since, slack)
         self.gaps += int(np.count_nonzero(count > 1))
         self.jitter = max(self.jitter, float(np.abs(step - count * period).max()))
         self.rows += int(np.count_nonzero(count)) + (self.rows == 0)
@@ -146,24 +146,24 @@ class Clock:
             f'{self.sample_time:g} s {what}: {NAMES[unit]}? Set time.unit = "{unit}"'
         )
 
-    def _period(self, step: np.ndarray) -> tuple[float, float]:
-        """Seconds of a step (the mean of neighbours where that surely differs), and how far such a mean may be off."""
+    def _period(self, step: np.ndarray) -> float:
+        """Seconds of a step: the sample time, or the mean over neighbouring rows where the two surely differ."""
         count = np.rint(step / self.sample_time)
         near = (count > 0) & (count <= NEAR)
         self.near_time += float(step[near].sum())
         self.near_steps += int(count[near].sum())
         self.runs += int(np.count_nonzero(count > NEAR))
         if not self.near_steps:
-            return self.sample_time, 0.0
+            return self.sample_time
         mean = self.near_time / self.near_steps
         error = 2 * self.tolerance * self.runs / self.near_steps
         if abs(mean - self.sample_time) <= error or abs(mean / self.sample_time - 1) > DRIFT:
-            return self.sample_time, error
-        return mean, error
+            return self.sample_time
+        return mean
 
     def _slack(self, stamps: Stamps) -> float:
         """Two stamps may both be off; and a large clock value is itself only known to a few units in its last place."""
-        return max(2 * self.tolerance, 1e-9 * self.sample_time, 8 * stamps.resolution)
+        return max(2 * self.tolerance, 8 * stamps.resolution, 8 * float(np.spacing(np.abs(stamps.since).max())))
 
     def _off(self, stamps: Stamps, bad: int) -> None:
         between = stamps.since[bad] - (stamps.since[bad - 1] if bad else self.since)
@@ -174,7 +174,7 @@ class Clock:
             'lie on no grid need dt = "as_input"'
         )
 
-    def _no_drift(self, stamps: Stamps, index: np.ndarray, since: np.ndarray, slack: float, error: float) -> None:
+    def _no_drift(self, stamps: Stamps, index: np.ndarray, since: np.ndarray, slack: float) -> None:
         limit = slack + (0.05 if self.found else DRIFT) * since
         wrong = np.abs(since - index * self.sample_time) > limit
         if wrong.any():
@@ -183,7 +183,7 @@ class Clock:
             here = since[bad] / max(index[bad], 1)
             raise UserError(
                 f"{stamps.place(bad)}: up to here the rows are {here:.6g} s apart on average, "
-                f'not sample_time = {self.sample_time:.9g} s; set sample_time = {rounded(mean, error):.9g}, or "auto"'
+                f'not sample_time = {self.sample_time:.9g} s; set sample_time = {rounded(mean, 1e-4 * mean):.9g}, or "auto"'
             )
 
 
@@ -247,7 +247,7 @@ def find_sample_time(stamps: Stamps) -> float:
 
 
 def rounded(value: float, error: float) -> float:
-    """The number with the fewest digits within `error` of a value, as a frequency where that has fewer.
+    """The number with the fewest digits within `error` of a value, as a whole number of Hz where that has fewer.
 
     >>> rounded(0.033333349, 1e-6) == 1 / 30, rounded(0.1000003, 1e-5)
     (True, 0.1)
@@ -258,6 +258,6 @@ def rounded(value: float, error: float) -> float:
         time, rate = float(f"{value:.{digits}g}"), float(f"{1 / value:.{digits}g}")
         if abs(time - value) <= error:
             return time
-        if abs(1 / rate - value) <= error:
+        if rate.is_integer() and abs(1 / rate - value) <= error:
             return 1 / rate
     return value

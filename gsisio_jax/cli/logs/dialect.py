@@ -102,7 +102,7 @@ def sniff(
         raise UserError(f"{name}: not a table of text: {error}") from error
     lines = re.sub("\r\n?", "\n", text).split("\n")
     # The last line is cut off where the file is longer than the head.
-    lines = lines[:-1] if len(lines) > 2 else lines
+    lines = lines[: min(len(lines) - (len(lines) > 2), 4 * LOOKED_AT)]
     comment, quote = _comment(lines) if part.comment is None else part.comment, part.quote or '"'
     layout = _layout(lines, part, comment, quote, [*wanted])
     rows = [cells for _, cells in _rows(lines[layout.first :], layout.separator, comment, quote)][:SAMPLE]
@@ -120,7 +120,7 @@ def sniff(
         f"{_WORDS.get(layout.separator, repr(layout.separator))} between cells" if layout.separator != "," else "",
         "decimal comma" if decimal == "," else "",
         f"thousands as in 1{thousands}000" if thousands else "",
-        f"comments after {comment}" if comment else "",
+        f"comments after {comment}" if comment and comment in text else "",
         f"header in line {layout.header}"
         if layout.header > 1
         else ""
@@ -176,7 +176,15 @@ def _layout(lines: list[str], part: DialectPart, comment: str, quote: str, wante
     named = [] if part.header is False else _by_names(lines, candidates, comment, quote, wanted, begin, part.skip)
     layouts = named or [_by_shape(lines, separator, part, comment, quote) for separator in candidates]
     # More lines of the header's length are better, then more columns, then the usual separator.
-    return max(layouts, key=lambda one: (*_agreement(lines, one, comment, quote), -candidates.index(one.separator)))
+    # A single column agrees with everything, so without a name that is no sign of it.
+    return max(
+        layouts,
+        key=lambda one: (
+            _agreement(lines, one, comment, quote) if named or len(one.columns) > 1 else 0.0,
+            len(one.columns),
+            -candidates.index(one.separator),
+        ),
+    )
 
 
 def _by_names(
@@ -210,11 +218,11 @@ def _by_shape(lines: list[str], separator: str, part: DialectPart, comment: str,
     return _Layout(separator, cells, begin + index + 1, begin + index + 1)
 
 
-def _agreement(lines: list[str], layout: _Layout, comment: str, quote: str) -> tuple[float, int]:
+def _agreement(lines: list[str], layout: _Layout, comment: str, quote: str) -> float:
+    """Share of the lines after the header that have as many cells, in tenths."""
     rows = _rows(lines[layout.first :], layout.separator, comment, quote)[:SAMPLE]
     same = sum(len(cells) == len(layout.columns) for _, cells in rows)
-    several = len(layout.columns) > 1
-    return (round(same / max(len(rows), 1), 1) * several, len(layout.columns))
+    return round(same / max(len(rows), 1), 1)
 
 
 def _unit_rows(rows: list[list[str]], layout: _Layout, wanted: Sequence[str], missing: Sequence) -> int:

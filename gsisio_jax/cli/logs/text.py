@@ -9,6 +9,7 @@ import gzip
 import io
 import lzma
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -82,7 +83,7 @@ def opened(path: Path, compression: str | None = None) -> Iterator[IO[bytes]]:
                 compression = find_compression(raw.read(8))
                 raw.seek(0)
             yield _decompressed(raw, compression, path.name, stack)
-    except (EOFError, zipfile.BadZipFile, lzma.LZMAError, gzip.BadGzipFile, zipfile.error) as error:
+    except (EOFError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, gzip.BadGzipFile) as error:
         raise UserError(f"{path.name}: the compressed file is damaged or ends too early: {reason(error)}") from error
     except OSError as error:
         raise UserError(f"{path}: cannot read the table: {reason(error)}") from error
