@@ -42,6 +42,7 @@ class Clock:
     sparse: bool = False
     rows: int = 0
     index: int = 0
+    start: float = 0.0
     since: float = 0.0
     shown: str = ""
     gaps: int = 0
@@ -68,7 +69,9 @@ class Clock:
         since = stamps.since
         if not len(since):
             return np.empty(0, np.int64)
-        step = np.diff(since, prepend=self.since if self.rows else since[0])
+        if not self.rows:
+            self.start = self.since = float(since[0])
+        step = np.diff(since, prepend=self.since)
         first = 0 if self.rows else 1  # the very first row has none before it
         check_order(stamps, step, self.shown, duplicates, self.rows > 0)
         self._plausible(stamps, step[first:])
@@ -89,11 +92,11 @@ class Clock:
         index = self.index + np.cumsum(count)
         if index[-1] > MAXIMUM_STEPS:
             raise UserError(
-                f"{stamps.place(len(stamps) - 1)}: the times span {since[-1]:.6g} s, more than {MAXIMUM_STEPS} steps "
+                f"{stamps.place(len(stamps) - 1)}: the times span {since[-1] - self.start:.6g} s, more than {MAXIMUM_STEPS} steps "
                 f"of {self.sample_time:g} s; check time.unit and sample_time"
             )
         index = index.astype(np.int64)
-        self._no_drift(stamps, index, since, slack)
+        self._no_drift(stamps, index, since - self.start, slack)
         self.gaps += int(np.count_nonzero(count > 1))
         self.jitter = max(self.jitter, float(np.abs(step - count * period).max()))
         self.rows += int(np.count_nonzero(count)) + (self.rows == 0)
@@ -179,11 +182,10 @@ class Clock:
         wrong = np.abs(since - index * self.sample_time) > limit
         if wrong.any():
             bad = int(np.argmax(wrong))
-            mean = since[-1] / index[-1] if index[-1] else math.inf
-            here = since[bad] / max(index[bad], 1)
+            mean = since[-1] / index[-1] if index[-1] else self.usual
             raise UserError(
-                f"{stamps.place(bad)}: up to here the rows are {here:.6g} s apart on average, "
-                f'not sample_time = {self.sample_time:.9g} s; set sample_time = {rounded(mean, 1e-4 * mean):.9g}, or "auto"'
+                f"{stamps.place(bad)}: the rows are {mean:.6g} s apart on average, not "
+                f'sample_time = {self.sample_time:.9g} s; set sample_time = {rounded(mean, 1e-4 * mean):.9g}, or "auto"'
             )
 
 

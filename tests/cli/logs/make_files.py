@@ -143,7 +143,7 @@ def write_parquet() -> None:
     frame.set_axis(dates).to_parquet(FOLDER / "date_index.parquet")
     words = frame.assign(t=[0, 1, 2], b=["-2", None, "4"])
     words.to_parquet(FOLDER / "numbers_as_text.parquet", index=False)
-    nanoseconds = [10**18 + 10**9 * row + row for row in range(3)]
+    nanoseconds = [10**18, 10**18 + 10**9 + 30, 10**18 + 2 * 10**9]
     frame.assign(t=nanoseconds).to_parquet(FOLDER / "nanoseconds.parquet", index=False)
 
 
