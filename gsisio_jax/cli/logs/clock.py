@@ -91,8 +91,9 @@ class Clock:
             )
         index = self.index + np.cumsum(count)
         if index[-1] > MAXIMUM_STEPS:
+            span = since[-1] - self.start
             raise UserError(
-                f"{stamps.place(len(stamps) - 1)}: the times span {since[-1] - self.start:.6g} s, more than {MAXIMUM_STEPS} steps "
+                f"{stamps.place(len(stamps) - 1)}: the times span {span:.6g} s, more than {MAXIMUM_STEPS} steps "
                 f"of {self.sample_time:g} s; check time.unit and sample_time"
             )
         index = index.astype(np.int64)
