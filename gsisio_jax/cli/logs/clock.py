@@ -125,7 +125,7 @@ class Clock:
         absent = self.index + 1 - self.rows
         how = "found sample_time = " if self.found else "sample_time = "
         gaps = f"{self.gaps} gap{'s' if self.gaps != 1 else ''}" + (
-            f" ({absent:,} steps without a row)" if absent else ""
+            f" ({absent:,} step{'s' if absent > 1 else ''} without a row)" if absent else ""
         )
         share = f"{self.rows:,} rows on {self.index + 1:,} steps ({100 * self.rows / (self.index + 1):.4g} %)"
         return f"{how}{self.sample_time:.9g} s: {share}, {gaps}, largest jitter {self.jitter:.2g} s"

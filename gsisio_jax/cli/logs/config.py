@@ -121,10 +121,11 @@ def _clock(value: Any) -> Any:
 
 
 def _sample_time(value: Any) -> Any:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if value is not None and value != "auto" and not (number and 0 < value < math.inf):
+    if value is None or value == "auto":
+        return value
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < math.inf:
         raise ValueError(f'must be a number of seconds greater than 0, or "auto"; got {value!r}')
-    return float(value) if number else value
+    return float(value)
 
 
 class TablePart(Part):

@@ -13,7 +13,7 @@ from . import numerals
 from .config import DialectPart
 from .text import find_compression, find_encoding, head_of, opened
 
-SEPARATORS = (",", ";", "\t", "|", " ")
+SEPARATORS: tuple[str, ...] = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
 LOOKED_AT = 200  # lines that may come before the header
 SAMPLE = 100  # rows whose cells show how numbers are written
