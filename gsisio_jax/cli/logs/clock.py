@@ -229,18 +229,19 @@ def find_sample_time(stamps: Stamps) -> float:
     step = step[step > 0]
     if len(step) < 2:
         raise UserError(f'{stamps.place(0)}: sample_time = "auto" needs at least three different times; give a number')
-    median = float(np.median(step))
-    # Twice: the first mean tells which differences are really one step.
+    median = mean = float(np.median(step))
+    # The second mean is over differences that are whole steps of the first, not of a median that jitters.
     for _ in range(2):
-        count = np.rint(step / median)
+        count = np.rint(step / mean)
         near = (count > 0) & (count <= NEAR)
         mean = float(step[near].sum() / count[near].sum())
-        median = mean
-    deviation = np.abs(step - np.rint(step / mean) * mean)
-    good = (deviation <= 0.2 * mean) & (np.rint(step / mean) > 0)
+    count = np.rint(step / mean)
+    near = (count > 0) & (count <= NEAR)
+    deviation = np.abs(step - count * mean)
+    good = (deviation <= 0.2 * mean) & (count > 0)
     if good.mean() < 0.9:
         raise UserError(
-            f'{stamps.place(0)}: sample_time = "auto" found steps of about {float(np.median(step)):.4g} s, but only '
+            f'{stamps.place(0)}: sample_time = "auto" found steps of about {median:.4g} s, but only '
             f"{good.mean():.0%} of the rows lie on such a grid; give sample_time, or "
             'dt = "as_input" where rows are uneven'
         )

@@ -151,12 +151,19 @@ def _comment(lines: list[str]) -> str:
 
 
 def _rows(lines: list[str], separator: str, comment: str, quote: str) -> list[tuple[int, list[str]]]:
-    """Index and cells of every line that is neither empty nor a comment."""
+    """Index and cells of every line that is neither empty nor a comment; of a row of several lines the last index."""
     found = []
-    for index, line in enumerate(lines):
-        line = line.partition(comment)[0] if comment else line
+    index = 0
+    while index < len(lines):
+        line = lines[index].partition(comment)[0] if comment else lines[index]
+        if line.count(quote) % 2:
+            # A line break inside of quotes; a quote that is never closed stands for itself.
+            closing = (end for end in range(index + 1, len(lines)) if lines[end].count(quote) % 2)
+            end = next(closing, index)
+            line, index = "\n".join(lines[index : end + 1]), end
         if line.strip():
             found.append((index, split(line, separator, quote)))
+        index += 1
     return found
 
 
@@ -175,12 +182,12 @@ def _layout(lines: list[str], part: DialectPart, comment: str, quote: str, wante
     begin = part.skip or 0
     named = [] if part.header is False else _by_names(lines, candidates, comment, quote, wanted, begin, part.skip)
     layouts = named or [_by_shape(lines, separator, part, comment, quote) for separator in candidates]
-    # More lines of the header's length are better, then more columns, then the usual separator.
+    # More lines of the header's length are better, then more numbers, more columns, the usual separator.
     # A single column agrees with everything, so without a name that is no sign of it.
     return max(
         layouts,
         key=lambda one: (
-            _agreement(lines, one, comment, quote) if named or len(one.columns) > 1 else 0.0,
+            *(_agreement(lines, one, comment, quote) if named or len(one.columns) > 1 else (0.0, 0.0)),
             len(one.columns),
             -candidates.index(one.separator),
         ),
@@ -218,11 +225,12 @@ def _by_shape(lines: list[str], separator: str, part: DialectPart, comment: str,
     return _Layout(separator, cells, begin + index + 1, begin + index + 1)
 
 
-def _agreement(lines: list[str], layout: _Layout, comment: str, quote: str) -> float:
-    """Share of the lines after the header that have as many cells, in tenths."""
+def _agreement(lines: list[str], layout: _Layout, comment: str, quote: str) -> tuple[float, float]:
+    """Shares, in tenths: of the lines after the header that have as many cells; of their cells that are numbers."""
     rows = _rows(lines[layout.first :], layout.separator, comment, quote)[:SAMPLE]
     same = sum(len(cells) == len(layout.columns) for _, cells in rows)
-    return round(same / max(len(rows), 1), 1)
+    every = [cell for _, cells in rows for cell in cells]
+    return round(same / max(len(rows), 1), 1), round(sum(map(numerals.is_number, every)) / max(len(every), 1), 1)
 
 
 def _unit_rows(rows: list[list[str]], layout: _Layout, wanted: Sequence[str], missing: Sequence) -> int:
@@ -233,7 +241,9 @@ def _unit_rows(rows: list[list[str]], layout: _Layout, wanted: Sequence[str], mi
     words = {str(word).strip().lower() for word in missing} | numerals.MISSING
 
     def speaks(cells: list[str]) -> bool:
-        looked = [cells[index] for index in chosen if index < len(cells)]
+        if len(cells) != len(layout.columns):
+            return False
+        looked = [cells[index] for index in chosen]
         return (
             any(looked)
             and not any(cell[:1].isdigit() or numerals.is_number(cell) for cell in looked)

@@ -19,6 +19,7 @@ from ..errors import UserError, reason
 
 HEAD = 1 << 18  # bytes that are looked at to find the dialect
 BLOCK = 1 << 24  # characters that are parsed at a time
+QUOTED_LINES = 1000  # of one cell, at most
 _MAGIC = {
     b"\x1f\x8b": "gz",
     b"PK\x03\x04": "zip",
@@ -167,7 +168,13 @@ def end_of_lines(text: str, quote: str) -> int:
     >>> end_of_lines('1,2' + chr(10) + '3,"a' + chr(10), '"')
     4
     """
-    cut = text.rfind("\n") + 1
-    while cut and text.count(quote, 0, cut) % 2:
-        cut = text.rfind("\n", 0, cut - 1) + 1
-    return cut
+    end = cut = text.rfind("\n") + 1
+    odd = text.count(quote, 0, cut) % 2
+    for _ in range(QUOTED_LINES):
+        if not odd or not cut:
+            return cut
+        before = text.rfind("\n", 0, cut - 1) + 1
+        odd ^= text.count(quote, before, cut) % 2
+        cut = before
+    # No cell is as long as that: somewhere a quote stands for itself, as in 5" pipe.
+    return end

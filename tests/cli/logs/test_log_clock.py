@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsisio_jax.cli.errors import UserError
@@ -51,6 +51,7 @@ def points(table):
     return there, table.y[there, 0]
 
 
+@settings(deadline=None)
 @given(grids(), st.sampled_from(list(PER_SECOND)), st.sampled_from([0.0, 1.7e9, -50.0]), st.data())
 def test_every_index_is_recovered(grid, unit, origin, data):
     period, index, _ = grid
@@ -68,6 +69,7 @@ def test_every_index_is_recovered(grid, unit, origin, data):
     assert (np.diff(table.time) > 0).all()
 
 
+@settings(deadline=None)
 @given(grids(), st.randoms(use_true_random=False))
 def test_any_order_is_sorted(grid, random):
     period, index, _ = grid
@@ -84,6 +86,7 @@ def test_any_order_is_sorted(grid, random):
     np.testing.assert_array_equal(np.array(order)[rows.astype(int)], np.arange(len(index)))
 
 
+@settings(deadline=None)
 @given(
     grids(), st.lists(st.integers(0, 60), min_size=1, max_size=9), st.sampled_from(["first", "last", "mean"]), st.data()
 )
@@ -102,6 +105,7 @@ def test_duplicates_are_merged_over_any_blocks(grid, again, how, data):
     assert reader.merged == len(values) - len(index)
 
 
+@settings(deadline=None)
 @given(st.sampled_from([*PERIODS, 0.103, 1 / 50, 0.004]), st.integers(0, 2**32), st.sampled_from([0.0, 1.7e9]))
 def test_the_sample_time_is_found(period, seed, origin):
     rng = np.random.default_rng(seed)
@@ -144,6 +148,7 @@ def test_a_wrong_sample_time_is_never_taken(period):
             read([block(values)], sample_time=period * factor)
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=30), st.data())
 def test_time_steps_are_those_to_the_next_row(steps, data):
     values = np.concatenate([[5.0], 5.0 + np.cumsum(steps)])

@@ -155,6 +155,17 @@ CASES = {
     "german_date.csv wrong": clock_refused(
         "row 2, .* is not a date of the form \"%Y\"", time={"column": "t", "format": "%Y"}
     ),
+    "date_and_time.csv": clock_refused(
+        "row 4, column 'Date', 'Time': the time is missing", time={"column": ["Date", "Time"]}
+    ),
+    "date_and_time.csv drop": clock(
+        *range(MAY, MAY + 4), time={"column": ["Date", "Time"]}, rows=[0, 1, None, 3], on_blank_time="drop"
+    ),
+    "german_date_and_time.csv": clock(
+        MAY - 36000.5, MAY - 35999.5, time={"column": ["Datum", "Zeit"], "format": "%d.%m.%Y %H:%M:%S,%f"}
+    ),
+    "stray_quote.csv": record(),
+    "iso_utc.csv as numbers": clock_refused("'2024-05-01T10:00:00Z' is not a number", time=MS),
     "time_of_day.csv": clock(-2208902402, -2208902401, time={"column": "t", "format": "%H:%M:%S"}),
     "blank_time.csv": clock_refused('row 3, .* the time is missing; .*, or set on_blank_time = "drop"'),
     "blank_time.csv drop": clock(0, 1, 2, rows=[0, 2, 3], on_blank_time="drop"),
