@@ -33,6 +33,11 @@ class Clock:
         unit: of the clock, for messages.
         found: whether `sample_time` was found in the times, so that it has no rounding to be held against them.
         sparse: whether most points of the grid may be without a row.
+        rows, index, start, since, shown: points that have a row, the last one, seconds of the first and the last row,
+            text of the last stamp.
+        gaps, jitter: for `describe`.
+        near_time, near_steps, runs: seconds and steps between neighbouring rows, and how often such a run began.
+        usual: median of the first differences, seconds.
     """
 
     sample_time: float
@@ -247,7 +252,8 @@ def find_sample_time(stamps: Stamps) -> float:
         )
     runs = 1 + int(np.count_nonzero(~near))
     jitter = float(deviation[good].max())
-    return rounded(mean, max(2 * jitter, 4 * stamps.resolution) * runs / float(count[near].sum()))
+    error = max(2 * jitter, 4 * stamps.resolution, 1e-12 * mean)
+    return rounded(mean, error * runs / float(count[near].sum()))
 
 
 def rounded(value: float, error: float) -> float:

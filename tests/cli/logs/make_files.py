@@ -97,6 +97,11 @@ TEXTS = {
     "rare_rows.csv": clock("0", "5", "10", "20"),
     "one_long_gap.csv": clock("0", "1", "2", "50", "51"),
     "no_clock.csv": "a\n1\n2\n\n4\n",
+    "no_clock_comments.csv": "# by hand\na\n1\n# break\n2 # two\n\n  # and\n4\n\n\n",
+    "no_clock_quotes.csv": '# by hand\n"a"\n"1"\n# break\n"2" # two\n\n"4"\n',
+    "trailing_comma_in_header.csv": PLAIN.replace("b\n", "b,\n"),
+    "trailing_blanks.csv": PLAIN.replace("\n", ", \n"),
+    "control_z.csv": PLAIN + "\x1a",
     "raw_counts.csv": "t,p,angle,speed,temp\n0,100,180,36,20\n1,200,-90,72,-40\n",
 }  # fmt: skip
 BYTES = {

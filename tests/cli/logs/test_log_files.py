@@ -195,6 +195,11 @@ CASES = {
     ),
     "one_long_gap.csv": clock(*range(52), rows=[0, 1, 2, *[None] * 47, 3, 4]),
     "no_clock.csv": ({"time": None, "y": ["a"], "sample_time": 0.5}, ([0, 0.5, 1, 1.5], [[1], [2], [NAN], [4]])),
+    "no_clock_comments.csv": ({"time": None, "y": ["a"]}, ([0, 1, 2, 3], [[1], [2], [NAN], [4]])),
+    "no_clock_quotes.csv": ({"time": None, "y": ["a"]}, ([0, 1, 2, 3], [[1], [2], [NAN], [4]])),
+    "trailing_comma_in_header.csv": record(),
+    "trailing_blanks.csv": record(),
+    "control_z.csv": record(),
     "raw_counts.csv": (
         {
             "y": ["p", "angle", "speed", "temp"],
@@ -234,4 +239,4 @@ def test_a_log_gives_its_reading_or_its_error(case):
 
 
 def test_every_file_has_a_case():
-    assert {case.partition(" ")[0] for case in CASES} | {"uneven.csv"} == {path.name for path in FOLDER.iterdir()}
+    assert {case.partition(" ")[0] for case in CASES} == {path.name for path in FOLDER.iterdir()}
