@@ -39,11 +39,15 @@ def is_parquet(path: Path) -> bool:
     return path.suffix.lower() in (".parquet", ".pq")
 
 
-def compression_of(path: Path) -> str:
+def find_compression(start: bytes) -> str:
     """By the first bytes, not by the name: a renamed file is read all the same."""
-    with opened(path, "none") as stream:
-        start = stream.read(8)
     return next((name for magic, name in _MAGIC.items() if start.startswith(magic)), "none")
+
+
+def compression_of(path: Path) -> str:
+    """`find_compression` of a file."""
+    with opened(path, "none") as stream:
+        return find_compression(stream.read(8))
 
 
 def find_encoding(head: bytes) -> str:

@@ -148,6 +148,7 @@ CASES = {
     "iso_local.csv in Berlin": clock(*range(MAY, MAY + 4), time=BERLIN, rows=[0, 1, None, 2]),
     "iso_mixed.csv": clock_refused("row 3, column 't': the date '2024-05-01T10:00:01' has no zone, the rows"),
     "iso_wrong.csv": clock_refused("row 3, column 't': '2024-05-32T10:00:01' is not a date of ISO 8601; give"),
+    "iso_slow.csv": clock_refused("1,998 of the 2,001 steps of sample_time = 1 s .* Set sample_time = 1000, or sparse"),
     "clocks_go_forward.csv": clock(1711846799, 1711846800, 1711846801, time=BERLIN),
     "clocks_go_back.csv": clock_refused("row 3, .* is there twice or not at all in Europe/Berlin", time=BERLIN),
     "german_date.csv": clock(*range(MAY, MAY + 4), time=FORMAT, rows=[0, 1, None, 2]),
