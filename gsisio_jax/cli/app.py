@@ -116,12 +116,12 @@ def _estimate(options: argparse.Namespace) -> int:
     if wanted is None:
         raise UserError(f"{path.name}: table is missing; estimate needs measurements")
 
+    from .logs import read_table
     from .output import check_writable, write_all, write_csv, write_netcdf
     from .problem import build_problem, importable, resolve
     from .progress import DelayedProgress
     from .report import show, summarise
     from .run import run
-    from .table import read_table
 
     out = options.out or Path("results") / path.stem
     names = config.outputs
@@ -137,15 +137,7 @@ def _estimate(options: argparse.Namespace) -> int:
         draw = resolve(names.draw, f"{path.name}: outputs.draw") if names.draw else _draw
         problem = build_problem(config, path.name)
         progress.stage("reading the table")
-        table = read_table(
-            path.parent / wanted.file,
-            time=wanted.time,
-            sample_time=wanted.sample_time,
-            y=wanted.y,
-            u=wanted.u,
-            missing=wanted.missing,
-            transform=transform or None,
-        )
+        table = read_table(path.parent / wanted.file, wanted, transform or None)
         outcome = run(problem, table, config.estimate.on_conflict, progress)
         progress.stage("writing the files")
         dataset = _dataset(outcome, problem, table, title)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import difflib
-import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from .errors import UserError, reason
 from .fields import Bounds, FileName, Number, Part, Reference, SignalName, check_box
+from .logs.config import TablePart
 from .study_config import MonteCarloPart, SweepPart
 
 
@@ -74,18 +74,6 @@ class DesignPart(Part):
     form: Literal["current", "prediction"] | None = None
     left_inverse: Literal["pseudo", "feedthrough", "smallest"] | None = None
     allow_uncertified: bool | None = None
-
-
-class TablePart(Part):
-    """The logged measurements."""
-
-    file: str
-    time: str
-    sample_time: Annotated[Number, Field(gt=0, lt=math.inf)]
-    y: Annotated[list[str], Field(min_length=1)]
-    u: list[str] = Field(default_factory=list)
-    missing: list[float | int | str] = Field(default_factory=list)
-    transform: Reference | None = None
 
 
 class EstimatePart(Part):
@@ -173,10 +161,15 @@ def _dotted(location: tuple[int | str, ...]) -> str:
 
 def _did_you_mean(location: tuple[int | str, ...]) -> str:
     model: type[BaseModel] | None = Config
+    named = False
     for part in location[:-1]:
-        if isinstance(part, str) and model is not None:
+        if isinstance(part, str) and model is not None and not named:
             field = model.model_fields.get(part)
             model = None if field is None else _model_in(field.annotation)
+            # The next part of a table of tables is a name that the user gave.
+            named = field is not None and get_origin(field.annotation) is dict
+        else:
+            named = False
     known = [] if model is None else [field.alias or name for name, field in model.model_fields.items()]
     close = difflib.get_close_matches(str(location[-1]), known, n=1)
     if close:

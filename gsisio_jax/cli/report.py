@@ -11,9 +11,9 @@ from typing import IO, Any
 import numpy as np
 
 from ..observer.status import Status
+from .logs import Table
 from .problem import Problem
 from .run import Outcome
-from .table import Table
 
 SHOWN_TIMES = 8
 SHOWN_ALARMS = 20
@@ -45,7 +45,8 @@ def summarise(
     whole, partly = int(absent.all(axis=1).sum()), int((absent.any(axis=1) & ~absent.all(axis=1)).sum())
     unbounded = int(np.count_nonzero(status & int(Status.UNBOUNDED)))
     facts = [
-        ("steps", f"{steps}, from {table.time[0]:.10g} s to {table.time[-1]:.10g} s"),
+        ("steps", f"{steps}, from {seconds(table.time[0])} s to {seconds(table.time[-1])} s"),
+        *table.notes,
         ("missing rows", f"{whole}" + (f", and {partly} with some entries missing" if partly else "")),
         ("conflicts", _conflicts(table.time[conflicts])),
         ("unbounded", f"{unbounded} steps with a state that is not bounded"),
@@ -71,7 +72,7 @@ def summarise(
 
 def alarm_line(record: dict[str, Any]) -> str:
     """One alarm as ``time: sentence``."""
-    return f"{record['time']:.10g} s: {record['text']}"
+    return f"{seconds(record['time'])} s: {record['text']}"
 
 
 def certificate_lines(certificate: Any, problem: Problem) -> list[str]:
@@ -93,7 +94,7 @@ def certificate_lines(certificate: Any, problem: Problem) -> list[str]:
 def _conflicts(times: np.ndarray) -> str:
     if len(times) == 0:
         return "0"
-    shown = ", ".join(f"{time:.10g}" for time in times[:SHOWN_TIMES])
+    shown = ", ".join(map(seconds, times[:SHOWN_TIMES]))
     return f"{len(times)}, at {shown}{', ...' if len(times) > SHOWN_TIMES else ''} s"
 
 
@@ -120,6 +121,15 @@ def _signals(problem: Problem, certificate: Any, dataset: Any) -> list[Row]:
                 )
             )
     return rows
+
+
+def seconds(time: float) -> str:
+    """A time with the digits that tell steps apart, also where it counts from 1970, and without those of its rounding.
+
+    >>> seconds(0.1 + 0.2), seconds(1714557600.6)
+    ('0.3', '1714557600.6')
+    """
+    return f"{time:.10g}" if abs(time) < 1e6 else f"{time:.15g}"
 
 
 def short(value: float) -> str:

@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from ..observer.estimation import OnConflict
+from .logs import Table
 from .problem import Problem
 from .progress import DelayedProgress
-from .table import Table
 
 CHUNK = 1024
 

@@ -14,10 +14,10 @@ import xarray
 
 import gsisio_jax as gx
 from gsisio_jax.cli.config import read_config
+from gsisio_jax.cli.logs import read_table
 from gsisio_jax.cli.problem import build_problem, importable
 from gsisio_jax.cli.progress import DelayedProgress
 from gsisio_jax.cli.run import run
-from gsisio_jax.cli.table import read_table
 
 
 def read_boxes(path):
@@ -106,8 +106,7 @@ def test_chunks_give_the_numbers_of_estimate(project, chunk):
     config = read_config(path)
     with importable(project.folder):
         problem = build_problem(config, "cart.toml")
-    wanted = config.table
-    table = read_table(project.folder / "cart.csv", time="t", sample_time=0.1, y=wanted.y, missing=wanted.missing)
+    table = read_table(project.folder / "cart.csv", config.table)
     with DelayedProgress("never") as progress:
         outcome = run(problem, table, "restart", progress, chunk=chunk)
     whole = gx.estimate(outcome.observer, problem.initial, table.y)
