@@ -1,0 +1,139 @@
+"""Where a long run stands, on the disk: a run that was killed goes on there and ends in the same boxes, bit for bit."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import io
+import shutil
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._version import __version__
+from ..study.disk import put
+from .boxes import Boxes
+from .errors import UserError, reason
+from .problem import Problem
+
+VERSION = 1
+EVERY = 5.0  # seconds from one to the next
+
+
+class Digest:
+    """What identifies the rows that were read, however they were cut into blocks."""
+
+    def __init__(self) -> None:
+        self._parts = [hashlib.blake2b(digest_size=16) for _ in range(3)]
+
+    def add(self, time: np.ndarray, y: np.ndarray, u: np.ndarray | None) -> None:
+        for part, values in zip(self._parts, (time, y, u), strict=True):
+            if values is not None:
+                part.update(np.ascontiguousarray(values, dtype=np.float64))
+
+    def __str__(self) -> str:
+        return "".join(part.hexdigest() for part in self._parts)
+
+
+def identity(observer: Any, problem: Problem, on_conflict: str, chunk: int) -> str:
+    """What two runs must share for one to go on where the other stopped.
+
+    All numbers of the observer and of the initial box, the source files of f and g, what the configuration hands to the
+    function that makes the system, and the version of the library.
+    """
+    found = hashlib.blake2b(digest_size=16)
+    for leaf in jax.tree.leaves((observer, problem.initial)):
+        values = np.asarray(leaf)
+        found.update(f"{values.dtype}{values.shape}".encode())
+        found.update(values.tobytes())
+    files = set()
+    for function in (observer.system.f, observer.system.g):
+        try:
+            files.add(inspect.getsourcefile(inspect.unwrap(function)))
+        except TypeError:
+            continue
+    for file in sorted(filter(None, files)):
+        if Path(file).is_file():
+            found.update(Path(file).read_bytes())
+    found.update(repr((on_conflict, chunk, problem.arguments, __version__, VERSION)).encode())
+    return found.hexdigest()
+
+
+class Checkpoint:
+    """A folder with the rows so far and the observer's carry after the last of them.
+
+    Args:
+        folder: not there before and after a run, and while a run is short.
+        every: seconds from one to the next.
+    """
+
+    def __init__(self, folder: Path, every: float = EVERY):
+        self.folder, self.rows = folder, 0
+        self._every, self._last = every, time.monotonic()
+
+    @property
+    def boxes(self) -> Path:
+        """The file of the rows."""
+        return self.folder / "rows.bin"
+
+    @property
+    def file(self) -> Path:
+        return self.folder / "checkpoint.npz"
+
+    def due(self, boxes: Boxes) -> bool:
+        return boxes.on_disk and time.monotonic() - self._last >= self._every
+
+    def save(self, boxes: Boxes, carry: Any, identity: str, digest: Digest) -> None:
+        """Rows first, then what refers to them; each whole or not at all."""
+        boxes.sync()
+        leaves = [np.asarray(leaf) for leaf in jax.device_get(jax.tree.leaves(carry))]
+        named = {f"carry_{index}": leaf for index, leaf in enumerate(leaves)}
+        stream = io.BytesIO()
+        np.savez(stream, rows=len(boxes), identity=identity, digest=str(digest), **named)
+        put(self.file, stream.getvalue())
+        self.rows, self._last = len(boxes), time.monotonic()
+
+    def load(self, identity: str, like: Any) -> tuple[Any, int, str] | None:
+        """The carry, the number of rows and their digest; None where there is nothing to go on from.
+
+        Args:
+            identity: of this run.
+            like: a carry of this observer.
+
+        Raises:
+            UserError: what is there belongs to another run, or cannot be read.
+        """
+        if not self.file.is_file():
+            return None
+        try:
+            with np.load(self.file, allow_pickle=False) as found:
+                stored = {name: found[name] for name in found.files}
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise UserError(f"--resume: cannot read {self.file}: {reason(error)}; begin anew without it") from error
+        if str(stored.get("identity")) != identity:
+            raise UserError(
+                f"--resume: the interrupted run in {self.folder} had another plant, noise, initial box, design or version "
+                "of this library; begin anew without --resume"
+            )
+        leaves, tree = jax.tree.flatten(like)
+        found = [jax.numpy.asarray(stored[f"carry_{index}"]) for index in range(len(leaves))]
+        self.rows = int(stored["rows"])
+        return jax.tree.unflatten(tree, found), self.rows, str(stored["digest"])
+
+    def forget(self) -> None:
+        """Remove an older one as soon as there are rows of another run."""
+        self.file.unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def refused(rows: int) -> UserError:
+    """The rows that are read again are not those of the interrupted run."""
+    return UserError(
+        f"--resume: the first {rows:,} steps of the table are not those of the interrupted run; begin anew without --resume"
+    )
