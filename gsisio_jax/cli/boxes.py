@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from .errors import UserError
 
 IN_MEMORY = 1 << 18  # rows
 PART = 1 << 17  # rows that are read at a time when the files are written
@@ -32,13 +34,14 @@ class Boxes:
 
     Args:
         kind: `record_type`.
-        path: file that takes the rows once there are more than `IN_MEMORY`; without it they stay in memory.
+        spill: called once, when there are more than `limit` rows: the file that takes them. Without it they stay in memory.
         limit: rows that stay in memory.
     """
 
-    def __init__(self, kind: np.dtype, path: Path | None = None, limit: int = IN_MEMORY):
-        self.kind, self.path, self._limit = kind, path, limit
+    def __init__(self, kind: np.dtype, spill: Callable[[], Path] | None = None, limit: int | None = None):
+        self.kind, self._spill, self._limit = kind, spill, IN_MEMORY if limit is None else limit
         self._rows: list[np.ndarray] = []
+        self._path = Path()
         self._file: Any = None
         self._count = 0
 
@@ -67,24 +70,23 @@ class Boxes:
         else:
             rows.tofile(self._file)
         self._count += len(rows)
-        if self._file is None and self.path is not None and self._count > self._limit:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = open(self.path, "w+b")  # noqa: SIM115
+        if self._file is None and self._spill is not None and self._count > self._limit:
+            self._path = self._spill()
+            self._file = open(self._path, "w+b")  # noqa: SIM115
             for some in self._rows:
                 some.tofile(self._file)
             self._rows = []
 
-    def reopen(self, count: int) -> None:
-        """Go on after the first `count` rows of the file; what came after them is dropped.
+    def reopen(self, path: Path, count: int) -> None:
+        """Go on after the first `count` rows of a file; what came after them is dropped.
 
         Raises:
-            ValueError: the file is shorter.
+            UserError: the file is shorter.
         """
-        assert self.path is not None
-        if not self.path.is_file() or self.path.stat().st_size < count * self.kind.itemsize:
-            raise ValueError(f"{self.path} has fewer than {count} rows")
-        self._rows, self._count = [], count
-        self._file = open(self.path, "r+b")  # noqa: SIM115
+        if not path.is_file() or path.stat().st_size < count * self.kind.itemsize:
+            raise UserError(f"--resume: {path} has fewer than {count:,} rows; begin anew without it")
+        self._rows, self._count, self._path = [], count, path
+        self._file = open(path, "r+b")  # noqa: SIM115
         self._file.truncate(count * self.kind.itemsize)
         self._file.seek(0, os.SEEK_END)
 
@@ -104,7 +106,7 @@ class Boxes:
             self._rows = [np.concatenate(self._rows)] if self._rows else [np.empty(0, self.kind)]
             return self._rows[0][begin:end]
         self._file.flush()
-        return np.fromfile(self.path, self.kind, end - begin, offset=begin * self.kind.itemsize)
+        return np.fromfile(self._path, self.kind, end - begin, offset=begin * self.kind.itemsize)
 
     def parts(self, size: int = PART) -> Iterator[np.ndarray]:
         """All rows, some at a time, with the input boxes at the step of the input: that of the last row is NaN.

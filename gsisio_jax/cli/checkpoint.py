@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import inspect
 import io
@@ -69,11 +70,17 @@ class Checkpoint:
     Args:
         folder: not there before and after a run, and while a run is short.
         every: seconds from one to the next.
+
+    Attributes:
+        rows: how many of this run's rows it has.
+        begun: this run has written to the folder.
     """
 
-    def __init__(self, folder: Path, every: float = EVERY):
-        self.folder, self.rows = folder, 0
-        self._every, self._last = every, time.monotonic()
+    def __init__(self, folder: Path, every: float | None = None):
+        self.folder, self.rows, self.begun = folder, 0, False
+        self._every, self._last = EVERY if every is None else every, time.monotonic()
+        self._missing = [parent for parent in folder.parents if not parent.exists()]
+        self._lock: Any = None
 
     @property
     def boxes(self) -> Path:
@@ -83,6 +90,14 @@ class Checkpoint:
     @property
     def file(self) -> Path:
         return self.folder / "checkpoint.npz"
+
+    def begin(self) -> Path:
+        """Make the folder, forget an older run, and say where the rows go."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._hold()
+        self.file.unlink(missing_ok=True)
+        self.begun = True
+        return self.boxes
 
     def due(self, boxes: Boxes) -> bool:
         return boxes.on_disk and time.monotonic() - self._last >= self._every
@@ -119,17 +134,40 @@ class Checkpoint:
                 f"--resume: the interrupted run in {self.folder} had another plant, noise, initial box, design or version "
                 "of this library; begin anew without --resume"
             )
+        self._hold()
         leaves, tree = jax.tree.flatten(like)
         found = [jax.numpy.asarray(stored[f"carry_{index}"]) for index in range(len(leaves))]
         self.rows = int(stored["rows"])
         return jax.tree.unflatten(tree, found), self.rows, str(stored["digest"])
 
-    def forget(self) -> None:
-        """Remove an older one as soon as there are rows of another run."""
-        self.file.unlink(missing_ok=True)
+    def leave(self) -> None:
+        """The run has failed or was stopped: what helps no other run goes."""
+        if self.begun and self.rows == 0:
+            self.remove()
+        elif self._lock is not None:
+            self._lock.close()
 
     def remove(self) -> None:
+        """Remove the folder, and those around it that were made for it and are empty."""
+        if self._lock is not None:
+            self._lock.close()
         shutil.rmtree(self.folder, ignore_errors=True)
+        for folder in self._missing:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+    def _hold(self) -> None:
+        """Keep a second run out of the folder; where files cannot be locked (Windows), there is no such guard."""
+        with contextlib.suppress(ImportError):
+            import fcntl
+
+            lock = open(self.folder / "lock", "w")  # noqa: SIM115
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                lock.close()
+                raise UserError(f"cannot write to {self.folder}: another run is at work there") from error
+            self._lock = lock
 
 
 def refused(rows: int) -> UserError:

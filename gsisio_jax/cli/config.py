@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -12,6 +11,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from .errors import UserError, reason
 from .fields import Bounds, FileName, Number, Part, Reference, SignalName, check_box
+from .logs.config import TablePart
 from .study_config import MonteCarloPart, SweepPart
 
 
@@ -75,18 +75,6 @@ class DesignPart(Part):
     allow_uncertified: bool | None = None
 
 
-class TablePart(Part):
-    """The logged measurements."""
-
-    file: str
-    time: str
-    sample_time: Annotated[Number, Field(gt=0, lt=math.inf)]
-    y: Annotated[list[str], Field(min_length=1)]
-    u: list[str] = Field(default_factory=list)
-    missing: list[float | int | str] = Field(default_factory=list)
-    transform: Reference | None = None
-
-
 class EstimatePart(Part):
     """Options of ``estimate``."""
 
@@ -99,6 +87,7 @@ class OutputsPart(Part):
     netcdf: FileName | None = None
     csv: FileName | None = None
     picture: FileName | None = None
+    report: FileName | None = None
     draw: Reference | None = None
 
 
@@ -139,9 +128,9 @@ def read_config(path: Path) -> Config:
         config = Config.model_validate(raw)
     except ValidationError as error:
         raise UserError(f"{path.name}: {_one_line(error)}") from error
-    names = config.outputs.model_dump(include={"netcdf", "csv", "picture"}, exclude_none=True)
+    names = config.outputs.model_dump(include={"netcdf", "csv", "picture", "report"}, exclude_none=True)
     if len(set(names.values())) < len(names):
-        raise UserError(f"{path.name}: outputs: netcdf, csv and picture must be different files")
+        raise UserError(f"{path.name}: outputs: netcdf, csv, picture and report must be different files")
     return config
 
 

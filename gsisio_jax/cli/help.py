@@ -78,3 +78,5 @@ A box that misses the truth ends the command with exit code 1 and the seed, run 
 gsisio monte-carlo paper --out DIR  runs a small one.
 """
 )
+
+INIT = ""

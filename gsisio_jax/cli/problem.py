@@ -108,7 +108,13 @@ def build_problem(config: Config, file: str) -> Problem:
 
     if config.table is not None:
         check("table.y", config.table.y, "outputs", "column")
-        check("table.u", config.table.u, "known inputs", "column")
+        if config.table.dt is None:
+            check("table.u", config.table.u, "known inputs", "column")
+        elif len(config.table.u) + 1 != system.m:
+            raise UserError(
+                f"{file}: table.u has {len(config.table.u)} column{'' if len(config.table.u) == 1 else 's'} and dt = "
+                f'"as_input" adds the time step as the last known input; the system has {system.m}'
+            )
     if config.u_region is not None and system.m == 0:
         raise UserError(f"{file}: u_region is given, the system has no known inputs")
     if config.region.auto:

@@ -13,9 +13,9 @@ import numpy as np
 from ..observer.estimation import OnConflict
 from .boxes import Boxes, record_type
 from .checkpoint import Checkpoint, Digest, identity, refused
+from .logs import Table
 from .problem import Problem
 from .progress import DelayedProgress
-from .table import Table
 
 CHUNK = 1024
 
@@ -76,7 +76,7 @@ def run(
     observer = design(problem)
     design_seconds = clock() - began
     system = problem.system
-    boxes = Boxes(record_type(system.n, system.p, system.l), checkpoint and checkpoint.boxes)
+    boxes = Boxes(record_type(system.n, system.p, system.l), checkpoint and checkpoint.begin)
     runner = _Runner(problem, observer, on_conflict, chunk, boxes, checkpoint)
     progress.stage("compiling")
     began = clock()
@@ -121,9 +121,9 @@ class _Runner:
         carry, out = gx.start(self.observer, self.problem.initial, row.y[0], u0=u0, on_conflict=self.on_conflict)
         self.carry = carry
         found = self.checkpoint.load(self.identity, carry) if self.checkpoint is not None and resume else None
-        if found is not None:
+        if found is not None and self.checkpoint is not None:
             self.carry, self.resumed, self._stored = found
-            self.boxes.reopen(self.resumed)
+            self.boxes.reopen(self.checkpoint.boxes, self.resumed)
             self._count(row)
         else:
             self._keep(row, jax.tree.map(lambda values: np.asarray(values)[None], out))
@@ -147,9 +147,11 @@ class _Runner:
         self._keep(part, jax.tree.map(lambda values: values[:steps], out))
 
     def end(self) -> None:
-        """Complain if the table has fewer rows than the checkpoint."""
+        """Complain if the table has fewer rows than the checkpoint; keep what a kill while files are written would cost."""
         if self._read < self.resumed:
             raise refused(self.resumed)
+        if self.checkpoint is not None and self.boxes.on_disk:
+            self._save(self.checkpoint)
 
     def _advance(self, part: Table, length: int) -> tuple[Any, Any]:
         import gsisio_jax as gx
@@ -170,7 +172,10 @@ class _Runner:
         if self.checkpoint is not None:
             self.digest.add(part.time, part.y, part.u)
             if self.checkpoint.due(self.boxes):
-                self.checkpoint.save(self.boxes, self.carry, self.identity, self.digest)
+                self._save(self.checkpoint)
+
+    def _save(self, checkpoint: Checkpoint) -> None:
+        checkpoint.save(self.boxes, self.carry, self.identity, self.digest)
 
 
 def chunks(blocks: Iterable[Table], size: int) -> Iterator[Table]:

@@ -15,11 +15,11 @@ import numpy as np
 from ..interval import Interval
 from ..plant.system import Noise
 from ..study import grid
-from .config import Config, TablePart
+from .config import Config
 from .errors import UserError, reason
+from .logs import Table, TablePart, read_table
 from .problem import Problem, resolve
 from .study_config import AxesPart, MonteCarloPart
-from .table import Table, read_table
 
 NOISE = {"both": "noise_scale", "w": "process_noise_scale", "v": "measurement_noise_scale"}
 INITIAL, RECORD = "initial_scale", "record"
@@ -92,15 +92,7 @@ def read_records(wanted: TablePart, patterns: str | list[str] | None, folder: Pa
     transform = wanted.transform and resolve(wanted.transform, f"{file}: table.transform")
 
     def read(path: Path) -> Table:
-        return read_table(
-            path,
-            time=wanted.time,
-            sample_time=wanted.sample_time,
-            y=wanted.y,
-            u=wanted.u,
-            missing=wanted.missing,
-            transform=transform or None,
-        )
+        return read_table(path, wanted, transform or None)
 
     if patterns is None or (isinstance(patterns, str) and (folder / patterns).is_file()):
         table = read(folder / (patterns or wanted.file))
@@ -111,7 +103,7 @@ def read_records(wanted: TablePart, patterns: str | list[str] | None, folder: Pa
     steps = int(lengths.max())
     y = np.stack([np.pad(t.y, ((0, steps - len(t.y)), (0, 0)), constant_values=np.nan) for t in tables])
     u = None
-    if wanted.u:
+    if tables[0].u is not None:
         # Known inputs must be finite also in rows that do not count.
         u = grid(
             RECORD, np.stack([np.pad(t.u, ((0, steps - len(t.u)), (0, 0)), "edge") for t in tables if t.u is not None])

@@ -112,7 +112,7 @@ def _panel(axis: Any, record: Record, series: Series, truth: Any) -> None:
     for index, when in enumerate(record.alarms):
         text = "certified alarm" if index == 0 else None
         axis.axvline(when, color=style.ALARM, linewidth=1.2, label=text, zorder=3.5)
-    axis.set_title(_widths(series), loc="right", fontsize="small", color="#444444")
+    axis.set_title(series.widths or _widths(series), loc="right", fontsize="small", color="#444444")
 
 
 def true_rows(call: str, name: str, truth: Any, steps: int, lead: tuple[int, ...] = ()) -> np.ndarray:

@@ -5,12 +5,20 @@ from __future__ import annotations
 import pytest
 
 CASES = {
-    "unknown key": ('time = "t"', 'tiem = "t"', ["cart.toml: ", "table.time is missing", "1 more problem"]),
+    "unknown key": ('time = "t"', 'tiem = "t"', ["cart.toml: unknown key table.tiem; did you mean time?"]),
     "misspelt key": ('missing = [-9999, "n/a"]', "mising = []", ["unknown key table.mising", "did you mean missing?"]),
     "unknown section": ("[outputs]", "[pictures]", ["unknown key pictures", "keys here are", "outputs"]),
     "signal key": ('name = "force", unit', 'name = "force", units', ["signals.input[0].units", "did you mean unit?"]),
-    "wrong type": ("sample_time = 0.1", 'sample_time = "0.1"', ["table.sample_time must be a valid number", "'0.1'"]),
-    "sample time": ("sample_time = 0.1", "sample_time = 0", ["table.sample_time must be greater than 0"]),
+    "wrong type": (
+        "sample_time = 0.1",
+        'sample_time = "0.1"',
+        ["table.sample_time: must be a number", "'0.1'"],
+    ),
+    "sample time": (
+        "sample_time = 0.1",
+        "sample_time = 0",
+        ['table.sample_time: must be a number of seconds greater than 0, or "auto"; got 0'],
+    ),
     "reference": ("cart_model:cart", "cart_model.cart", ['system.use: must read "module:attribute"']),
     "module": ("cart_model:cart", "no_such_module:cart", ["system.use: cannot import no_such_module"]),
     "attribute": ("cart_model:cart", "cart_model:card", ["system.use: cart_model has no attribute card"]),
@@ -40,7 +48,7 @@ CASES = {
     "u not there": ('y = ["pos"', 'u = ["pos"]\ny = ["pos"', ["table.u has 1 column, the system has no known inputs"]),
     "u region": ("[initial]", "[u_region]\nradius = [1.0]\n[initial]", ["u_region is given", "no known inputs"]),
     "file name": ('"boxes.csv"', '"../boxes.csv"', ["outputs.csv: must be a plain file name"]),
-    "same file": ('"boxes.csv"', '"cart.nc"', ["outputs: netcdf, csv and picture must be different files"]),
+    "same file": ('"boxes.csv"', '"cart.nc"', ["outputs: netcdf, csv, picture and report must be different files"]),
     "syntax": ("[noise]", "[noise", ["cart.toml: not valid TOML", "line 8"]),
     "conflict rule": ("[outputs]", "[estimate]\non_conflict = 'stop'\n[outputs]", ["estimate.on_conflict", "'stop'"]),
     "gains": ("sweeps = 1", "gains = 0", ["design.gains must be greater than or equal to 1"]),

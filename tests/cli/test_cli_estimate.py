@@ -14,10 +14,10 @@ import xarray
 
 import gsisio_jax as gx
 from gsisio_jax.cli.config import read_config
+from gsisio_jax.cli.logs import read_table
 from gsisio_jax.cli.problem import build_problem, importable
 from gsisio_jax.cli.progress import DelayedProgress
 from gsisio_jax.cli.run import run
-from gsisio_jax.cli.table import read_table
 
 
 def read_boxes(path):
@@ -29,7 +29,7 @@ def read_boxes(path):
 def test_files_and_guarantee(project):
     code, _out, err = project.run()
     assert (code, err) == (0, "")
-    assert sorted(path.name for path in project.out.iterdir()) == ["boxes.csv", "cart.nc", "cart.png"]
+    assert sorted(path.name for path in project.out.iterdir()) == ["boxes.csv", "cart.html", "cart.nc", "cart.png"]
     boxes, header = read_boxes(project.out / "boxes.csv")
     signals = ["position", "velocity", "force"]
     assert header == ["time", *(f"{name}_{side}" for name in signals for side in ("lower", "upper")), "status"]
@@ -106,17 +106,17 @@ def test_chunks_give_the_numbers_of_estimate(project, chunk):
     config = read_config(path)
     with importable(project.folder):
         problem = build_problem(config, "cart.toml")
-    wanted = config.table
-    table = read_table(project.folder / "cart.csv", time="t", sample_time=0.1, y=wanted.y, missing=wanted.missing)
+    table = read_table(project.folder / "cart.csv", config.table)
     with DelayedProgress("never") as progress:
-        outcome = run(problem, table, "restart", progress, chunk=chunk)
+        outcome = run(problem, [table], "restart", progress, chunk=chunk)
     whole = gx.estimate(outcome.observer, problem.initial, table.y)
-    for name in ("state", "input", "current_input"):
-        ours, theirs = getattr(outcome.estimate, name), getattr(whole, name)
-        np.testing.assert_array_equal(ours.lower, theirs.lower)
-        np.testing.assert_array_equal(ours.upper, theirs.upper)
-    np.testing.assert_array_equal(outcome.estimate.status, whole.status)
-    np.testing.assert_array_equal(outcome.estimate.margin, whole.margin)
+    (ours,) = outcome.boxes.parts()
+    np.testing.assert_array_equal(ours["state_lower"], whole.state.lower)
+    np.testing.assert_array_equal(ours["state_upper"], whole.state.upper)
+    np.testing.assert_array_equal(ours["input_lower"][:-1], whole.input.lower)
+    np.testing.assert_array_equal(ours["input_upper"][:-1], whole.input.upper)
+    for name in ("status", "margin", "source"):
+        np.testing.assert_array_equal(ours[name], getattr(whole, name))
 
 
 def test_one_row_is_enough(project):

@@ -1,0 +1,188 @@
+"""Lines of text to columns, through the C parser of pandas.
+
+It does not say where a cell is that it cannot read, drops cells of lines that are too long and fills up lines that are
+too short. So lines are measured first, on bytes, and a block that the parser refuses is read again as text.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..._extras import need
+from ..errors import UserError
+from .cells import Block, Cells, check_columns
+from .dialect import Dialect
+from .text import BLOCK, blocks_of_lines, opened
+
+_LINE_FEED, _SPACE, _TAB = b"\n \t"
+
+
+def text_blocks(
+    path: Path,
+    dialect: Dialect,
+    wanted: Sequence[str],
+    missing: Sequence[float | str],
+    as_text: Sequence[str] = (),
+    size: int = BLOCK,
+) -> Iterator[Block]:
+    """Blocks of a text file.
+
+    Args:
+        path: the file.
+        dialect: how it is written.
+        wanted: columns that are read.
+        missing: cells that mean missing, besides empty ones and the usual words.
+        as_text: those of `wanted` whose cells stay text.
+        size: characters of a block.
+
+    Raises:
+        UserError: anything that cannot be read; one line with row and column.
+    """
+    parser = Parser(path.name, dialect, wanted, missing, as_text)
+    with opened(path, dialect.compression) as stream:
+        for line, text in blocks_of_lines(stream, dialect.encoding, dialect.quote, path.name, size):
+            block = parser.parse(line, text)
+            if len(block):
+                yield block
+
+
+class Parser:
+    """Lines of text to columns; arguments as of `text_blocks`."""
+
+    def __init__(
+        self,
+        name: str,
+        dialect: Dialect,
+        wanted: Sequence[str],
+        missing: Sequence[float | str],
+        as_text: Sequence[str] = (),
+    ):
+        check_columns(name, dialect.columns, wanted)
+        self.name, self.dialect = name, dialect
+        self.wanted = {dialect.columns.index(one): one for one in wanted}
+        self.as_text = {index for index, one in self.wanted.items() if one in as_text}
+        self.cells = Cells(missing, dialect.decimal, dialect.thousands)
+        self._pandas = need("pandas", extra="cli", purpose="the command line")
+        self._comment = None
+        if dialect.comment:
+            quote, mark = re.escape(dialect.quote), re.escape(dialect.comment)
+            self._comment = re.compile(rf"({quote}[^{quote}]*{quote})|{mark}[^\n]*")
+
+    def parse(self, line: int, text: str) -> Block:
+        """Columns of some whole lines.
+
+        Args:
+            line: number of the first one in the file, counted from 1.
+            text: lines, each with a line feed at its end.
+        """
+        data, rows = self._rows(line, text)
+        if not len(rows):
+            return Block(self.name, {one: np.empty(0) for one in self.wanted.values()}, rows)
+        # Only a strict look at every cell tells 1,234 from 1,23 where commas stand between thousands.
+        frame = None if self.dialect.thousands else self._fast(data)
+        if frame is None:
+            frame = self.frame(data, dict.fromkeys(self.wanted, object))
+        columns = {one: frame[index].to_numpy() for index, one in self.wanted.items()}
+        block = Block(self.name, columns, rows)
+        for index, one in self.wanted.items():
+            if index not in self.as_text:
+                columns[one] = self.cells.numbers(block, one)
+        return block
+
+    def text(self, line: int, text: str) -> tuple[Any, np.ndarray]:
+        """All columns of some whole lines as text, by position, and the numbers of the rows."""
+        data, rows = self._rows(line, text)
+        everything = dict.fromkeys(range(len(self.dialect.columns)), object)
+        return self.frame(data, everything), rows
+
+    def _rows(self, line: int, text: str) -> tuple[bytes, np.ndarray]:
+        """The lines that are rows, and their numbers; comments and what comes before the first row are dropped."""
+        skipped = self.dialect.first_line - line
+        if skipped > 0:
+            lines = text.split("\n", skipped)
+            text, line = lines[-1] if len(lines) > skipped else "", self.dialect.first_line
+        if self._comment is not None and self.dialect.comment in text:
+            text = self._comment.sub(lambda found: found[1] or "", text)
+        if not text:
+            return b"", np.empty(0, np.int64)
+        return self._measured(text.encode("utf-8", "surrogatepass"), line)
+
+    def _measured(self, data: bytes, line: int) -> tuple[bytes, np.ndarray]:
+        """Drop empty lines; complain about a line with too many or too few cells."""
+        separator, width = ord(self.dialect.separator), len(self.dialect.columns)
+        bytes_ = np.frombuffer(data, np.uint8)
+        ends = np.flatnonzero(bytes_ == _LINE_FEED)
+        rows = line + np.arange(len(ends))
+        if self.dialect.separator == " ":
+            gap = (bytes_ == _SPACE) | (bytes_ == _TAB) | (bytes_ == _LINE_FEED)
+            marks = ~gap
+            marks[1:] &= gap[:-1]  # cells begin after a gap
+        else:
+            marks = bytes_ == separator
+        if self.dialect.quote.encode() in data:
+            inside = np.cumsum(bytes_ == ord(self.dialect.quote), dtype=np.uint8) % 2 == 1
+            # A cell in quotes begins with its quote, which is the first byte that counts as inside.
+            marks &= ~inside | (bytes_ == ord(self.dialect.quote))
+            kept = ~inside[ends]
+            ends, rows = ends[kept], rows[kept]
+        starts = np.concatenate([[0], ends[:-1] + 1])
+        cells = np.add.reduceat(marks, starts, dtype=np.int32) + (self.dialect.separator != " ")
+        if width > 1:
+            # A table of one column may have empty cells; elsewhere a line without anything is no row.
+            empty = np.zeros(len(ends), bool)
+            for index in np.flatnonzero(cells <= 1):
+                empty[index] = not data[starts[index] : ends[index]].strip()
+            if empty.any():
+                data = bytes_[np.repeat(~empty, ends - starts + 1)].tobytes()
+                starts, ends, rows, cells = starts[~empty], ends[~empty], rows[~empty], cells[~empty]
+        else:
+            cells = np.maximum(cells, 1)
+        closing = (cells == width + 1) & (bytes_[ends - 1] == separator)  # 1,2,3, has no fourth cell
+        wrong = (cells != width) & ~closing
+        if wrong.any():
+            bad = int(np.argmax(wrong))
+            raise UserError(
+                f"{self.name}: row {rows[bad]} has {cells[bad]} cell{'s' if cells[bad] > 1 else ''}, "
+                f"the header has {width}"
+            )
+        return data, rows
+
+    def _fast(self, data: bytes) -> Any:
+        """Floats by the C parser; None where it meets a cell that it cannot read."""
+        types = {index: object if index in self.as_text else np.float64 for index in self.wanted}
+        try:
+            return self.frame(data, types)
+        except ValueError:
+            return None
+
+    def frame(self, data: bytes, types: dict[int, Any]) -> Any:
+        """Columns by their position, each of its type: floats with NaN where missing, or text."""
+        space = self.dialect.separator == " "
+        numbers = [index for index, kind in types.items() if kind is not object]
+        # Older versions of pandas round the last digit wrongly unless they are told not to.
+        exact = {} if int(self._pandas.__version__.split(".")[0]) > 2 else {"float_precision": "round_trip"}
+        return self._pandas.read_csv(
+            io.BytesIO(data),
+            sep=r"\s+" if space else self.dialect.separator,
+            header=None,
+            names=range(len(self.dialect.columns)),
+            index_col=False,
+            usecols=list(types),
+            dtype=types,
+            decimal=self.dialect.decimal,
+            quotechar=self.dialect.quote,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            na_values={index: self.cells.words for index in numbers},
+            keep_default_na=False,
+            na_filter=bool(numbers),
+            encoding="utf-8",
+            engine="c",
+            **exact,
+        )
