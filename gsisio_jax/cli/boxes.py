@@ -29,12 +29,29 @@ def record_type(n: int, p: int, l: int) -> np.dtype:
     )
 
 
+def records(kind: np.dtype, time: np.ndarray, y: np.ndarray, out: Any) -> np.ndarray:
+    """Rows as `record_type` has them.
+
+    Args:
+        kind: `record_type`.
+        time: (R,) seconds.
+        y: (R, l), NaN where missing.
+        out: their `StepOutput`; its `input` is the box of the input one step before.
+    """
+    rows = np.empty(len(time), kind)
+    rows["time"], rows["y"] = time, y
+    rows["state_lower"], rows["state_upper"] = out.state.lower, out.state.upper
+    rows["input_lower"], rows["input_upper"] = out.input.lower, out.input.upper
+    rows["status"], rows["margin"], rows["source"] = out.status, out.margin, out.source
+    return rows
+
+
 class Boxes:
     """Rows that grow at the end.
 
     Args:
         kind: `record_type`.
-        spill: called once, when there are more than `limit` rows: the file that takes them. Without it they stay in memory.
+        spill: called once, when there are more than `limit` rows: the file that takes them; else they stay in memory.
         limit: rows that stay in memory.
     """
 
@@ -53,18 +70,8 @@ class Boxes:
         return self._file is not None
 
     def append(self, time: np.ndarray, y: np.ndarray, out: Any) -> None:
-        """Add R rows.
-
-        Args:
-            time: (R,) seconds.
-            y: (R, l), NaN where missing.
-            out: their `StepOutput`; its `input` is the box of the input one step before.
-        """
-        rows = np.empty(len(time), self.kind)
-        rows["time"], rows["y"] = time, y
-        rows["state_lower"], rows["state_upper"] = out.state.lower, out.state.upper
-        rows["input_lower"], rows["input_upper"] = out.input.lower, out.input.upper
-        rows["status"], rows["margin"], rows["source"] = out.status, out.margin, out.source
+        """Add R rows; arguments as of `records`."""
+        rows = records(self.kind, time, y, out)
         if self._file is None:
             self._rows.append(rows)
         else:

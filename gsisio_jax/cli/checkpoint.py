@@ -131,8 +131,8 @@ class Checkpoint:
             raise UserError(f"--resume: cannot read {self.file}: {reason(error)}; begin anew without it") from error
         if str(stored.get("identity")) != identity:
             raise UserError(
-                f"--resume: the interrupted run in {self.folder} had another plant, noise, initial box, design or version "
-                "of this library; begin anew without --resume"
+                f"--resume: the interrupted run in {self.folder} had another plant, noise, initial box, design or "
+                "version of this library; begin anew without --resume"
             )
         self._hold()
         leaves, tree = jax.tree.flatten(like)
@@ -173,5 +173,6 @@ class Checkpoint:
 def refused(rows: int) -> UserError:
     """The rows that are read again are not those of the interrupted run."""
     return UserError(
-        f"--resume: the first {rows:,} steps of the table are not those of the interrupted run; begin anew without --resume"
+        f"--resume: the first {rows:,} steps of the table are not those of the interrupted run; begin anew without "
+        "--resume"
     )

@@ -71,7 +71,8 @@ def estimate(options: argparse.Namespace, path: Path, config: Config, wanted: Ta
                     raise
                 raise UserError(f"{error} (what comes before is kept: mend it and add --resume)") from error
             raise Interrupted(
-                f"interrupted, no file was written; the same command with --resume goes on after step {checkpoint.rows:,}"
+                "interrupted, no file was written; the same command with --resume goes on after step "
+                f"{checkpoint.rows:,}"
             ) from error
         except BaseException:
             checkpoint.leave()
@@ -117,9 +118,9 @@ def _write(
             target,
             summary,
             totals,
-            target.parent / names["picture"],
-            str(observer.certificate),
-            path.read_text("utf-8"),
+            picture=target.parent / names["picture"],
+            certificate=str(observer.certificate),
+            configuration=path.read_text("utf-8"),
         ),
     }
     write_all(out, writers, checkpoint.folder if outcome.boxes.on_disk else None)

@@ -60,8 +60,8 @@ th, td { text-align: right; padding: .3rem .6rem; border-bottom: 1px solid var(-
 th { color: var(--dim); font-weight: 500; }
 th:first-child, td:first-child { text-align: left; padding-left: 0; }
 td.words, th.words { text-align: left; white-space: normal; min-width: 16rem; }
-pre { margin: .5rem 0 0; padding: .75rem; overflow-x: auto; font: 13px/1.45 ui-monospace, monospace; background: var(--page);
-  border: 1px solid var(--line); border-radius: .4rem; }
+pre { margin: .5rem 0 0; padding: .75rem; overflow-x: auto; font: 13px/1.45 ui-monospace, monospace;
+  background: var(--page); border: 1px solid var(--line); border-radius: .4rem; }
 summary { cursor: pointer; color: var(--blue); }
 ul { margin: 0; padding-left: 1.2rem; }
 li { overflow-wrap: anywhere; }
@@ -76,7 +76,7 @@ li { overflow-wrap: anywhere; }
 
 
 def write_page(
-    path: Path, summary: Summary, totals: Totals, picture: Path, certificate: str, configuration: str
+    path: Path, summary: Summary, totals: Totals, *, picture: Path, certificate: str, configuration: str
 ) -> None:
     """Write the report of a run.
 

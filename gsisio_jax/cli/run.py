@@ -147,7 +147,7 @@ class _Runner:
         self._keep(part, jax.tree.map(lambda values: values[:steps], out))
 
     def end(self) -> None:
-        """Complain if the table has fewer rows than the checkpoint; keep what a kill while files are written would cost."""
+        """Complain if the table is shorter than the checkpoint. A kill while files are written shall cost nothing."""
         if self._read < self.resumed:
             raise refused(self.resumed)
         if self.checkpoint is not None and self.boxes.on_disk:
