@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from .errors import UserError, reason
 from .fields import Bounds, FileName, Number, Part, Reference, SignalName, check_box
+from .fill_in import check_filled_in
 from .logs.config import TablePart
 from .study_config import MonteCarloPart, SweepPart
 
@@ -124,6 +125,7 @@ def read_config(path: Path) -> Config:
         raise UserError(f"{path.name}: not valid TOML: {reason(error)}") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path.name}: not valid TOML: the file is not UTF-8 text") from error
+    check_filled_in(raw, path)
     try:
         config = Config.model_validate(raw)
     except ValidationError as error:
