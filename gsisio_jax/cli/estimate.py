@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,8 @@ def estimate(options: argparse.Namespace, path: Path, config: Config, wanted: Ta
     out = options.out or Path("results") / path.stem
     names = _file_names(config.outputs, path.stem)
     check_writable(out, list(names.values()))
+    source = table_path(options, path, wanted)
+    _check_apart(out, names, (source, path))
     title = config.title or path.stem
     checkpoint = Checkpoint(out / f".{path.stem}.part")
     with importable(path.parent), DelayedProgress(options.progress) as progress:
@@ -49,7 +51,7 @@ def estimate(options: argparse.Namespace, path: Path, config: Config, wanted: Ta
         draw = _draw(config.outputs, path.name)
         problem = build_problem(config, path.name)
         progress.stage("reading the table")
-        table = TableStream(table_path(options, path, wanted), wanted, transform or None)
+        table = TableStream(source, wanted, transform or None)
         try:
             outcome = run(
                 problem,
@@ -131,6 +133,16 @@ def _write(
 def _file_names(outputs: OutputsPart, stem: str) -> dict[str, str]:
     endings = {"netcdf": ".nc", "csv": ".csv", "picture": ".png", "report": ".html"}
     return {kind: getattr(outputs, kind) or stem + ending for kind, ending in endings.items()}
+
+
+def _check_apart(out: Path, names: dict[str, str], read: Iterable[Path]) -> None:
+    """The files that are read must not be written over: `pump.csv` may be the log and the boxes of `pump.toml`."""
+    for kind, name in names.items():
+        if any(one.exists() and (out / name).resolve() == one.resolve() for one in read):
+            raise UserError(
+                f"cannot write {out / name}: it is a file that is read; give another --out, or name another file in "
+                f"outputs.{kind}"
+            )
 
 
 def _draw(outputs: OutputsPart, file: str) -> Callable[[Labelled, Path], None]:

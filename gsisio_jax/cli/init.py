@@ -11,7 +11,7 @@ import numpy as np
 
 from .errors import UserError
 from .init_columns import Column, look_at
-from .init_text import Clocked, configuration, plant
+from .init_text import Clocked, configuration, measured, plant
 from .logs.cells import Block
 from .logs.clock import Clock, find_sample_time
 from .logs.config import ClockPart, DialectPart
@@ -54,14 +54,14 @@ def init(path: Path, out: Path) -> int:
     columns = [look_at(name, cells, *marks) for name, cells in block.columns.items()]
     clock = _clock(columns, block)
     columns = [column for column in columns if clock is None or column.name != clock.column]
-    numbers = [column for column in columns if column.numeric]
-    if not numbers:
+    used = measured(columns)
+    if not used:
         raise UserError(f"{path.name}: no column of numbers was found; the columns are: {', '.join(block.columns)}")
     try:
         file = str(path.resolve().relative_to(out.resolve()))
     except ValueError:
         file = str(path.resolve())
-    texts = configuration(file, path.name, found, len(block), clock, columns), plant(path.name, clock, len(numbers))
+    texts = configuration(file, path.name, found, len(block), clock, columns), plant(path.name, clock, len(used))
     for written in write_all(
         out, {name: lambda target, text=text: _put(target, text) for name, text in zip(names, texts, strict=True)}
     ):

@@ -43,6 +43,11 @@ class Column:
     rises: bool
 
     @property
+    def stand_ins(self) -> int:
+        """Cells with one of the `sentinels`."""
+        return int(np.isin(self.values, self.sentinels).sum())
+
+    @property
     def constant(self) -> bool:
         return self.resolution is None
 
@@ -91,6 +96,13 @@ def _numbers(cells: Any, decimal: str, thousands: str) -> tuple[np.ndarray, int,
     return values, empty, words
 
 
+def _stands_for_missing(value: float) -> bool:
+    """-99, -9999, 999999, or the end of a range of integers."""
+    digits = f"{abs(value):.0f}"
+    nines = value == round(value) and len(digits) > 1 and set(digits) == {"9"}
+    return nines or abs(value) in (32767, 32768, 65535, 2147483647, 2147483648)
+
+
 def _sentinels(values: np.ndarray) -> tuple[float, ...]:
     """Numbers such as -9999 or 32767, at an end and far from all others, that are there more than once."""
     found: list[float] = []
@@ -100,20 +112,8 @@ def _sentinels(values: np.ndarray) -> tuple[float, ...]:
             break
         value = float(end(rest))
         others = rest[rest != value]
-        digits = f"{abs(value):.0f}"
-        usual = (set(digits) == {"9"} and len(digits) > 1) or abs(value) in (
-            32767,
-            32768,
-            65535,
-            2147483647,
-            2147483648,
-        )
-        if not usual or value != round(value) or len(others) < 2 or len(rest) - len(others) < 2:
-            continue
-        span = max(float(others.max() - others.min()), 1e-300)
-        if (
-            min(abs(others.min() - value), abs(others.max() - value)) > FAR * span
-            or abs(value) > FAR * np.abs(others).max()
-        ):
-            found.append(value)
+        if _stands_for_missing(value) and len(rest) - len(others) > 1 and len(others) > 1:
+            near = min(abs(others.min() - value), abs(others.max() - value))
+            if near > FAR * (others.max() - others.min()) or abs(value) > FAR * np.abs(others).max():
+                found.append(value)
     return tuple(found)

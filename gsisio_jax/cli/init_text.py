@@ -44,14 +44,14 @@ def configuration(file: str, name: str, dialect: str, rows: int, clock: Clocked 
         clock: the clock, if one was found.
         columns: the others.
     """
-    used = [column for column in columns if column.numeric and not column.constant] or [
-        column for column in columns if column.numeric
-    ]
-    outputs = ", ".join(f"{{name = {_quoted(label)}}}" for label in _labels(used))
+    used = measured(columns)
+    outputs = ", ".join(
+        f"{{name = {_quoted(label)}{unit and f', unit = {_quoted(unit)}'}}}" for label, unit in _labels(used)
+    )
     radius = ", ".join(f"{(column.resolution or 0.0) / 2:.4g}" for column in used)
     return f"""\
-# Written by gsisio init from the first {rows:,} rows of {name}. Fill in what says FILL_IN, here and in plant.py, and take
-# out of y, output and noise.v what you do not measure with. Then: gsisio estimate THIS_FILE
+# Written by gsisio init from the first {rows:,} rows of {name}.
+# Fill in what says FILL_IN, here and in plant.py, and take out of y, output and noise.v what you do not measure with.
 title = {_quoted(name)}
 
 [system]
@@ -97,6 +97,12 @@ y = [{", ".join(_quoted(column.name) for column in used)}]
 """
 
 
+def measured(columns: list[Column]) -> list[Column]:
+    """Columns that may be measurements: numbers that are not all the same, or all numbers where there is none."""
+    numbers = [column for column in columns if column.numeric]
+    return [column for column in numbers if not column.constant] or numbers
+
+
 def plant(name: str, clock: Clocked | None, outputs: int) -> str:
     """Text of the module."""
     step = "FILL_IN" if clock is None or clock.sample_time is None else repr(clock.sample_time)
@@ -123,7 +129,7 @@ def f(x):
 
 
 def g(x):
-    """Measurements, ({outputs},) for all columns of the file, without unknown input and noise."""
+    """Measurements, ({outputs},) for all columns in y, without unknown input and noise."""
     return FILL_IN  # jnp.stack([x[0], x[1]])
 
 
@@ -142,20 +148,21 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-def _labels(columns: list[Column]) -> list[str]:
-    """Column names as signal names: letters, digits and _ . + - only, each once."""
-    labels: list[str] = []
+def _labels(columns: list[Column]) -> list[tuple[str, str]]:
+    """Signal names (letters, digits and _ . + - only, each once) and units, from names such as ``Level 1 [m]``."""
+    labels: dict[str, str] = {}
     for column in columns:
-        label = re.sub(r"[^\w .+-]+", "_", column.name).strip(" _") or "y"
+        bare, unit = re.fullmatch(r"(.*?)\s*(?:[\[(]([^\[\]()]*)[\])])?", column.name, re.DOTALL).groups()  # type: ignore[union-attr]
+        label = re.sub(r"[^\w .+-]+", "_", bare).strip(" _") or "y"
         label = label if re.match(r"[^\W\d]", label) else f"y_{label}"
         while label in labels:
             label += "_"
-        labels.append(label)
-    return labels
+        labels[label] = unit or ""
+    return list(labels.items())
 
 
 def _found(dialect: str) -> str:
-    return f"# Found by looking: {dialect}. Keys of [table.dialect] override that.\n" if dialect else ""
+    return f"# Found by looking: {dialect}.\n# Keys of [table.dialect] override that.\n" if dialect else ""
 
 
 def _clock(clock: Clocked | None) -> str:
@@ -190,7 +197,7 @@ def _missing(columns: list[Column]) -> str:
             found |= dict.fromkeys(int(value) for value in column.sentinels)
             found |= dict.fromkeys(word for word, _ in column.words)
     if not found:
-        return '# missing = [-9999, "---"]         # cells that mean missing, besides empty ones, NaN, NA and the like'
+        return '# missing = [-9999, "---"]         # cells that mean missing, besides empty ones, NaN and NA'
     listed = ", ".join(str(one) if isinstance(one, int) else _quoted(one) for one in found)
     return f"# These cells look as if they meant missing; take out what does not.\nmissing = [{listed}]"
 
@@ -204,7 +211,7 @@ def _columns(columns: list[Column], used: list[Column]) -> str:
             continue
         facts = [f"{column.low:.6g} to {column.high:.6g}"]
         facts.append("constant" if column.constant else f"resolution {column.resolution:.4g}")
-        absent = column.empty + sum(count for _, count in column.words)
+        absent = column.empty + column.stand_ins + sum(count for _, count in column.words)
         facts += [f"{absent:,} cells missing"] if absent else []
         facts += ["not in y"] if column not in used else []
         lines.append(f"#   {name}: {', '.join(facts)}")

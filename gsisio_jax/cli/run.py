@@ -80,15 +80,18 @@ def run(
     runner = _Runner(problem, observer, on_conflict, chunk, boxes, checkpoint)
     progress.stage("compiling")
     began = clock()
-    rows = chunks(blocks, chunk)
-    first = next(rows)
-    runner.begin(first, resume)
-    progress.stage("estimating", total=total)
-    progress.advance(1)
-    for part in rows:
-        runner.feed(part)
-        progress.advance(len(part.time))
-    runner.end()
+    try:
+        rows = chunks(blocks, chunk)
+        runner.begin(next(rows), resume)
+        progress.stage("estimating", total=total)
+        progress.advance(1)
+        for part in rows:
+            runner.feed(part)
+            progress.advance(len(part.time))
+        runner.end()
+    except BaseException:
+        boxes.close()
+        raise
     seconds = clock() - began - runner.compile_seconds
     return Outcome(observer, boxes, design_seconds, runner.compile_seconds, seconds, runner.resumed)
 
