@@ -93,6 +93,9 @@ def write_netcdf(datasets: Iterable[Any], path: Path) -> None:
     chunks = {name: {"chunksizes": (CHUNK,)} for name in first.variables}
     first.to_netcdf(path, engine="netcdf4", unlimited_dims=["time"], encoding=chunks)
     with netcdf4.Dataset(path, "a") as file:
+        for variable in file.variables.values():
+            # By default up to 64 MiB of each variable stay in memory.
+            variable.set_var_chunk_cache(size=2 * 8 * CHUNK)
         for dataset in itertools.chain([second], several):
             begin = len(file.dimensions["time"])
             rows = slice(begin, begin + dataset.sizes["time"])
