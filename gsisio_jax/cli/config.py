@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
@@ -163,10 +163,15 @@ def _dotted(location: tuple[int | str, ...]) -> str:
 
 def _did_you_mean(location: tuple[int | str, ...]) -> str:
     model: type[BaseModel] | None = Config
+    named = False
     for part in location[:-1]:
-        if isinstance(part, str) and model is not None:
+        if isinstance(part, str) and model is not None and not named:
             field = model.model_fields.get(part)
             model = None if field is None else _model_in(field.annotation)
+            # The next part of a table of tables is a name that the user gave.
+            named = field is not None and get_origin(field.annotation) is dict
+        else:
+            named = False
     known = [] if model is None else [field.alias or name for name, field in model.model_fields.items()]
     close = difflib.get_close_matches(str(location[-1]), known, n=1)
     if close:

@@ -15,6 +15,23 @@ CONFIG is a TOML file. It names the system ("module:attribute", also a module be
 noise bounds, the region, the initial box, the table of measurements (CSV or Parquet) and the outputs.
 The built-in examples are commented and meant to be copied.
 
+The table [table] says how the log is written; docs/logs.md explains every key:
+
+  [table]
+  file = "log.csv"                   # also .gz .zip .bz2 .xz .zst, or Parquet; separator, header, decimal
+                                     # comma, encoding are found, or set in [table.dialect]
+  time = "t"                         # seconds or ISO dates; {column = "t", unit = "ms", tolerance = 0.01},
+                                     # {column = "t", format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"};
+                                     # left out: rows one sample apart
+  sample_time = "auto"               # or seconds; dt = "as_input" in its place: rows on no grid, the time
+                                     # step is the last known input
+  y = ["position", "speed"]          # columns of the outputs; u = [...] of the known inputs
+  missing = ["---", -9999]           # what means missing, besides empty cells, NaN, NA, null and their like
+  columns = {speed = {unit = "km/h"}}  # to SI; also to = "m/s", scale = 0.1, offset = -40
+  on_duplicate = "mean"              # or first, last; on_unsorted = "sort", on_blank_time = "drop";
+                                     # left out: such rows are errors
+  sparse = true                      # most steps have no row, and that is meant
+
 estimate writes three files: a labelled NetCDF, a CSV with the columns
 time,<signal>_lower,<signal>_upper,...,status  and a PNG. status is a sum of
 1 conflict (a certified alarm), 2 missing data, 4 unbounded, 8 outside the region, 16 crossed,

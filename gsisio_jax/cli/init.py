@@ -102,10 +102,13 @@ def _clock(columns: list[Column], block: Block) -> Clocked | None:
     if not likely:
         return None
     column = max(likely, key=lambda one: one[:3])[3]
-    part = ClockPart(column=column.name, unit=_unit(column))
-    cells = block.columns[column.name] if part.unit is None and is_date_column(block.columns[column.name]) else None
-    values = column.values if cells is None else cells
-    return _measured(part, Block(block.name, {column.name: values}, block.rows))
+    unit = _unit(column)
+    cells = block.columns[column.name]
+    if unit is not None or not is_date_column(cells):
+        cells = column.values
+    return _measured(
+        Clocked(column.name, unit, cells is not column.values), Block(block.name, {column.name: cells}, block.rows)
+    )
 
 
 def _unit(column: Column) -> str | None:
@@ -119,11 +122,10 @@ def _unit(column: Column) -> str | None:
     return "epoch" if any(1e9 <= first / scale <= 5e9 for scale in (1.0, 1e3, 1e6, 1e9)) else None
 
 
-def _measured(part: ClockPart, block: Block) -> Clocked:
-    """Sample time, gaps, doubles and disorder of a clock, as far as they can be told."""
-    clocked = Clocked(part.column, part.unit, is_date_column(block.columns[part.column]))
+def _measured(clocked: Clocked, block: Block) -> Clocked:
+    """The same with sample time, gaps, doubles and disorder, as far as they can be told."""
     try:
-        stamps = StampReader(part).read(block)
+        stamps = StampReader(ClockPart.model_validate({"column": clocked.column, "unit": clocked.unit})).read(block)
     except UserError as error:
         return replace(clocked, trouble=str(error))
     empty = np.isnan(stamps.since)

@@ -10,7 +10,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from .._version import __version__
-from .report import Summary, short
+from .report import Summary, seconds, short
 from .totals import Totals
 
 SHOWN_ALARMS = 500
@@ -103,7 +103,7 @@ def write_page(
     verdict = "No alarm" if count == 0 else f"{count:,} certified alarm{'s' if count > 1 else ''}"
     head = (
         f"<h1>{escape(summary.title)}</h1>"
-        f'<p class="dim">{totals.steps:,} steps, {totals.first:.10g} s to {totals.last:.10g} s · '
+        f'<p class="dim">{totals.steps:,} steps, {seconds(totals.first)} s to {seconds(totals.last)} s · '
         f"gsisio_jax {__version__}</p>"
         f'<p class="verdict{" bad" if count else ""}">{verdict}</p>'
     )
@@ -139,7 +139,7 @@ def _alarms(totals: Totals) -> list[str]:
     shown = totals.alarms[:SHOWN_ALARMS]
     rows = [
         (
-            f"{alarm['time']:.10g}",
+            seconds(alarm["time"]),
             str(alarm["step"]),
             _SOURCES.get(alarm["kind"], alarm["kind"]),
             short(-alarm["gap"]),

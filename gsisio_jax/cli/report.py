@@ -40,7 +40,7 @@ def summarise(
     partly = f", and {totals.partly} with some entries missing" if totals.partly else ""
     estimated = totals.steps - outcome.resumed
     facts = [
-        ("steps", f"{totals.steps}, from {totals.first:.10g} s to {totals.last:.10g} s"),
+        ("steps", f"{totals.steps}, from {seconds(totals.first)} s to {seconds(totals.last)} s"),
         *notes,
         ("missing rows", f"{totals.absent}{partly}"),
         ("conflicts", _conflicts(totals.alarm_times)),
@@ -67,7 +67,7 @@ def summarise(
 
 def alarm_line(record: dict[str, Any]) -> str:
     """One alarm as ``time: sentence``."""
-    return f"{record['time']:.10g} s: {record['text']}"
+    return f"{seconds(record['time'])} s: {record['text']}"
 
 
 def certificate_lines(certificate: Any, problem: Problem) -> list[str]:
@@ -89,7 +89,7 @@ def certificate_lines(certificate: Any, problem: Problem) -> list[str]:
 def _conflicts(times: np.ndarray) -> str:
     if len(times) == 0:
         return "0"
-    shown = ", ".join(f"{time:.10g}" for time in times[:SHOWN_TIMES])
+    shown = ", ".join(map(seconds, times[:SHOWN_TIMES]))
     return f"{len(times)}, at {shown}{', ...' if len(times) > SHOWN_TIMES else ''} s"
 
 
@@ -115,6 +115,15 @@ def promised(totals: Totals, certificate: Any) -> Iterator[tuple[Signal, float |
     inputs = ((width, None) for width in np.asarray(certificate.input_width))
     for signal, (width, room) in zip(totals.signals, (*states, *inputs), strict=True):
         yield (signal, float(width), room) if certificate.certified else (signal, None, None)
+
+
+def seconds(time: float) -> str:
+    """A time with the digits that tell steps apart, also where it counts from 1970, and without those of its rounding.
+
+    >>> seconds(0.1 + 0.2), seconds(1714557600.6)
+    ('0.3', '1714557600.6')
+    """
+    return f"{time:.10g}" if abs(time) < 1e6 else f"{time:.15g}"
 
 
 def short(value: float) -> str:

@@ -52,6 +52,65 @@ CASES = {
     "syntax": ("[noise]", "[noise", ["cart.toml: not valid TOML", "line 8"]),
     "conflict rule": ("[outputs]", "[estimate]\non_conflict = 'stop'\n[outputs]", ["estimate.on_conflict", "'stop'"]),
     "gains": ("sweeps = 1", "gains = 0", ["design.gains must be greater than or equal to 1"]),
+    "clock": (
+        'time = "t"',
+        "time = 3",
+        ['table.time: must be a column or a table such as {column = "t", unit = "ms"}'],
+    ),
+    "clock key": (
+        'time = "t"',
+        'time = {column = "t", unt = "ms"}',
+        ["unknown key table.time.unt; did you mean unit?"],
+    ),
+    "clock unit": ('time = "t"', 'time = {column = "t", unit = "sec"}', ["table.time.unit must be 's', 'ms'", "'sec'"]),
+    "clock both": (
+        'time = "t"',
+        'time = {column = "t", unit = "s", format = "%S"}',
+        ["table.time: give either unit or"],
+    ),
+    "zone": ('time = "t"', 'time = {column = "t", zone = "Europe/Berln"}', ["did you mean Europe/Berlin?"]),
+    "zone of numbers": (
+        'time = "t"',
+        'time = {column = "t", unit = "s", zone = "UTC"}',
+        ["zone is for dates that lack"],
+    ),
+    "tolerance": (
+        'time = "t"',
+        'time = {column = "t", tolerance = 0.03}',
+        ["table: time.tolerance = 0.03 s", "0.025 s"],
+    ),
+    "no clock": ('time = "t"\nsample_time = 0.1', 'sample_time = "auto"', ['table: sample_time = "auto" needs time']),
+    "dt": (
+        'time = "t"',
+        'time = "t"\ndt = "as_input"',
+        ['table: give either sample_time or dt = "as_input", not both'],
+    ),
+    "dt alone": ('time = "t"\nsample_time = 0.1', 'dt = "as_input"', ['table: dt = "as_input" needs time, the column']),
+    "dt of no input": (
+        "sample_time = 0.1",
+        'dt = "as_input"',
+        ['table.u has 0 columns and dt = "as_input" adds the time step as the last known input; the system has 0'],
+    ),
+    "unit": ("[design]", '[table.columns]\npos = {unit = "kmh"}\n[design]', ['unit "kmh"; did you mean km/h?', "mbar"]),
+    "units": (
+        "[design]",
+        '[table.columns]\npos = {unit = "km", to = "deg"}\n[design]',
+        ['table.columns.pos: "km" is of length, "deg" of angle; known for length: m, km'],
+    ),
+    "unit key": (
+        "[design]",
+        "[table.columns]\npos = {scal = 2}\n[design]",
+        ["table.columns.pos.scal", "did you mean scale"],
+    ),
+    "scale": ("[design]", "[table.columns]\npos = {scale = 0}\n[design]", ["table.columns.pos: scale must not be 0"]),
+    "column of nothing": ("[design]", "[table.columns]\nnote = {scale = 2}\n[design]", ["columns.note is not among y"]),
+    "separator": (
+        "[design]",
+        '[table.dialect]\nseparator = "::"\n[design]',
+        ["dialect.separator: must be one character"],
+    ),
+    "same marks": ("[design]", '[table.dialect]\nseparator = ","\ndecimal = ","\n[design]', ["must be different char"]),
+    "encoding": ("[design]", '[table.dialect]\nencoding = "ansi8"\n[design]', ['unknown encoding "ansi8"; usual ones']),
     "draw": ("[outputs]", '[outputs]\ndraw = "cart_model:paint"', ["outputs.draw: cart_model has no attribute paint"]),
 }
 

@@ -42,6 +42,7 @@ class Clock:
     sparse: bool = False
     rows: int = 0
     index: int = 0
+    start: float = 0.0
     since: float = 0.0
     shown: str = ""
     gaps: int = 0
@@ -68,11 +69,13 @@ class Clock:
         since = stamps.since
         if not len(since):
             return np.empty(0, np.int64)
-        step = np.diff(since, prepend=self.since if self.rows else since[0])
+        if not self.rows:
+            self.start = self.since = float(since[0])
+        step = np.diff(since, prepend=self.since)
         first = 0 if self.rows else 1  # the very first row has none before it
         check_order(stamps, step, self.shown, duplicates, self.rows > 0)
         self._plausible(stamps, step[first:])
-        period, error = self._period(step[first:])
+        period = self._period(step[first:])
         count = np.rint(step / period)
         slack = self._slack(stamps)
         off = np.abs(step - count * period) > slack
@@ -88,12 +91,13 @@ class Clock:
             )
         index = self.index + np.cumsum(count)
         if index[-1] > MAXIMUM_STEPS:
+            span = since[-1] - self.start
             raise UserError(
-                f"{stamps.place(len(stamps) - 1)}: the times span {since[-1]:.6g} s, more than {MAXIMUM_STEPS} steps "
+                f"{stamps.place(len(stamps) - 1)}: the times span {span:.6g} s, more than {MAXIMUM_STEPS} steps "
                 f"of {self.sample_time:g} s; check time.unit and sample_time"
             )
         index = index.astype(np.int64)
-        self._no_drift(stamps, index, since, slack, error)
+        self._no_drift(stamps, index, since - self.start, slack)
         self.gaps += int(np.count_nonzero(count > 1))
         self.jitter = max(self.jitter, float(np.abs(step - count * period).max()))
         self.rows += int(np.count_nonzero(count)) + (self.rows == 0)
@@ -121,7 +125,7 @@ class Clock:
         absent = self.index + 1 - self.rows
         how = "found sample_time = " if self.found else "sample_time = "
         gaps = f"{self.gaps} gap{'s' if self.gaps != 1 else ''}" + (
-            f" ({absent:,} steps without a row)" if absent else ""
+            f" ({absent:,} step{'s' if absent > 1 else ''} without a row)" if absent else ""
         )
         share = f"{self.rows:,} rows on {self.index + 1:,} steps ({100 * self.rows / (self.index + 1):.4g} %)"
         return f"{how}{self.sample_time:.9g} s: {share}, {gaps}, largest jitter {self.jitter:.2g} s"
@@ -146,24 +150,24 @@ class Clock:
             f'{self.sample_time:g} s {what}: {NAMES[unit]}? Set time.unit = "{unit}"'
         )
 
-    def _period(self, step: np.ndarray) -> tuple[float, float]:
-        """Seconds of a step (the mean of neighbours where that surely differs), and how far such a mean may be off."""
+    def _period(self, step: np.ndarray) -> float:
+        """Seconds of a step: the sample time, or the mean over neighbouring rows where the two surely differ."""
         count = np.rint(step / self.sample_time)
         near = (count > 0) & (count <= NEAR)
         self.near_time += float(step[near].sum())
         self.near_steps += int(count[near].sum())
         self.runs += int(np.count_nonzero(count > NEAR))
         if not self.near_steps:
-            return self.sample_time, 0.0
+            return self.sample_time
         mean = self.near_time / self.near_steps
         error = 2 * self.tolerance * self.runs / self.near_steps
         if abs(mean - self.sample_time) <= error or abs(mean / self.sample_time - 1) > DRIFT:
-            return self.sample_time, error
-        return mean, error
+            return self.sample_time
+        return mean
 
     def _slack(self, stamps: Stamps) -> float:
         """Two stamps may both be off; and a large clock value is itself only known to a few units in its last place."""
-        return max(2 * self.tolerance, 1e-9 * self.sample_time, 8 * stamps.resolution)
+        return max(2 * self.tolerance, 8 * stamps.resolution, 8 * float(np.spacing(np.abs(stamps.since).max())))
 
     def _off(self, stamps: Stamps, bad: int) -> None:
         between = stamps.since[bad] - (stamps.since[bad - 1] if bad else self.since)
@@ -174,16 +178,15 @@ class Clock:
             'lie on no grid need dt = "as_input"'
         )
 
-    def _no_drift(self, stamps: Stamps, index: np.ndarray, since: np.ndarray, slack: float, error: float) -> None:
+    def _no_drift(self, stamps: Stamps, index: np.ndarray, since: np.ndarray, slack: float) -> None:
         limit = slack + (0.05 if self.found else DRIFT) * since
         wrong = np.abs(since - index * self.sample_time) > limit
         if wrong.any():
             bad = int(np.argmax(wrong))
-            mean = since[-1] / index[-1] if index[-1] else math.inf
-            here = since[bad] / max(index[bad], 1)
+            mean = since[-1] / index[-1] if index[-1] else self.usual
             raise UserError(
-                f"{stamps.place(bad)}: up to here the rows are {here:.6g} s apart on average, "
-                f'not sample_time = {self.sample_time:.9g} s; set sample_time = {rounded(mean, error):.9g}, or "auto"'
+                f"{stamps.place(bad)}: the rows are {mean:.6g} s apart on average, not "
+                f'sample_time = {self.sample_time:.9g} s; set sample_time = {rounded(mean, 1e-4 * mean):.9g}, or "auto"'
             )
 
 
@@ -226,18 +229,19 @@ def find_sample_time(stamps: Stamps) -> float:
     step = step[step > 0]
     if len(step) < 2:
         raise UserError(f'{stamps.place(0)}: sample_time = "auto" needs at least three different times; give a number')
-    median = float(np.median(step))
-    # Twice: the first mean tells which differences are really one step.
+    median = mean = float(np.median(step))
+    # The second mean is over differences that are whole steps of the first, not of a median that jitters.
     for _ in range(2):
-        count = np.rint(step / median)
+        count = np.rint(step / mean)
         near = (count > 0) & (count <= NEAR)
         mean = float(step[near].sum() / count[near].sum())
-        median = mean
-    deviation = np.abs(step - np.rint(step / mean) * mean)
-    good = (deviation <= 0.2 * mean) & (np.rint(step / mean) > 0)
+    count = np.rint(step / mean)
+    near = (count > 0) & (count <= NEAR)
+    deviation = np.abs(step - count * mean)
+    good = (deviation <= 0.2 * mean) & (count > 0)
     if good.mean() < 0.9:
         raise UserError(
-            f'{stamps.place(0)}: sample_time = "auto" found steps of about {float(np.median(step)):.4g} s, but only '
+            f'{stamps.place(0)}: sample_time = "auto" found steps of about {median:.4g} s, but only '
             f"{good.mean():.0%} of the rows lie on such a grid; give sample_time, or "
             'dt = "as_input" where rows are uneven'
         )
@@ -247,7 +251,7 @@ def find_sample_time(stamps: Stamps) -> float:
 
 
 def rounded(value: float, error: float) -> float:
-    """The number with the fewest digits within `error` of a value, as a frequency where that has fewer.
+    """The number with the fewest digits within `error` of a value, as a whole number of Hz where that has fewer.
 
     >>> rounded(0.033333349, 1e-6) == 1 / 30, rounded(0.1000003, 1e-5)
     (True, 0.1)
@@ -258,6 +262,6 @@ def rounded(value: float, error: float) -> float:
         time, rate = float(f"{value:.{digits}g}"), float(f"{1 / value:.{digits}g}")
         if abs(time - value) <= error:
             return time
-        if abs(1 / rate - value) <= error:
+        if rate.is_integer() and abs(1 / rate - value) <= error:
             return 1 / rate
     return value

@@ -33,6 +33,13 @@ def _one_character(value: str) -> str:
     return value
 
 
+def _clock_columns(value: Any) -> tuple[str, ...]:
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list | tuple) or not names or not all(isinstance(name, str) and name for name in names):
+        raise ValueError(f'must be a column, or columns that are read as one such as ["Date", "Time"]; got {value!r}')
+    return tuple(names)
+
+
 def _encoding(name: str) -> str:
     try:
         "".encode(name)
@@ -44,10 +51,11 @@ def _encoding(name: str) -> str:
 class ClockPart(Part):
     """The column of the time and how it is written; ``time = "t"`` stands for ``time = {column = "t"}``.
 
-    Without `unit` and `format`: numbers are seconds, dates are ISO 8601.
+    Without `unit` and `format`: numbers are seconds, dates are ISO 8601. A date and a time of day in two columns are
+    read as one cell with a blank between them.
     """
 
-    column: Annotated[str, Field(min_length=1)]
+    column: Annotated[tuple[str, ...], BeforeValidator(_clock_columns)]
     unit: ClockUnit | None = None
     format: Annotated[str, Field(min_length=1)] | None = None
     zone: Annotated[str, AfterValidator(_zone)] | None = None
@@ -121,10 +129,11 @@ def _clock(value: Any) -> Any:
 
 
 def _sample_time(value: Any) -> Any:
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if value is not None and value != "auto" and not (number and 0 < value < math.inf):
+    if value is None or value == "auto":
+        return value
+    if not isinstance(value, int | float) or isinstance(value, bool) or not 0 < value < math.inf:
         raise ValueError(f'must be a number of seconds greater than 0, or "auto"; got {value!r}')
-    return float(value) if number else value
+    return float(value)
 
 
 class TablePart(Part):
@@ -176,5 +185,5 @@ class TablePart(Part):
     @property
     def wanted(self) -> list[str]:
         """Columns that are read: the clock, y and u, without repetition."""
-        clock = [] if self.time is None else [self.time.column]
+        clock = () if self.time is None else self.time.column
         return list(dict.fromkeys([*clock, *self.y, *self.u]))

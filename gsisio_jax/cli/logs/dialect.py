@@ -13,7 +13,7 @@ from . import numerals
 from .config import DialectPart
 from .text import find_compression, find_encoding, head_of, opened
 
-SEPARATORS = (",", ";", "\t", "|", " ")
+SEPARATORS: tuple[str, ...] = (",", ";", "\t", "|", " ")
 COMMENTS = ("#", "%", "//")
 LOOKED_AT = 200  # lines that may come before the header
 SAMPLE = 100  # rows whose cells show how numbers are written
@@ -102,7 +102,7 @@ def sniff(
         raise UserError(f"{name}: not a table of text: {error}") from error
     lines = re.sub("\r\n?", "\n", text).split("\n")
     # The last line is cut off where the file is longer than the head.
-    lines = lines[:-1] if len(lines) > 2 else lines
+    lines = lines[: min(len(lines) - (len(lines) > 2), 4 * LOOKED_AT)]
     comment, quote = _comment(lines) if part.comment is None else part.comment, part.quote or '"'
     layout = _layout(lines, part, comment, quote, [*wanted])
     rows = [cells for _, cells in _rows(lines[layout.first :], layout.separator, comment, quote)][:SAMPLE]
@@ -120,7 +120,7 @@ def sniff(
         f"{_WORDS.get(layout.separator, repr(layout.separator))} between cells" if layout.separator != "," else "",
         "decimal comma" if decimal == "," else "",
         f"thousands as in 1{thousands}000" if thousands else "",
-        f"comments after {comment}" if comment else "",
+        f"comments after {comment}" if comment and comment in text else "",
         f"header in line {layout.header}"
         if layout.header > 1
         else ""
@@ -151,12 +151,19 @@ def _comment(lines: list[str]) -> str:
 
 
 def _rows(lines: list[str], separator: str, comment: str, quote: str) -> list[tuple[int, list[str]]]:
-    """Index and cells of every line that is neither empty nor a comment."""
+    """Index and cells of every line that is neither empty nor a comment; of a row of several lines the last index."""
     found = []
-    for index, line in enumerate(lines):
-        line = line.partition(comment)[0] if comment else line
+    index = 0
+    while index < len(lines):
+        line = lines[index].partition(comment)[0] if comment else lines[index]
+        if line.count(quote) % 2:
+            # A line break inside of quotes; a quote that is never closed stands for itself.
+            closing = (end for end in range(index + 1, len(lines)) if lines[end].count(quote) % 2)
+            end = next(closing, index)
+            line, index = "\n".join(lines[index : end + 1]), end
         if line.strip():
             found.append((index, split(line, separator, quote)))
+        index += 1
     return found
 
 
@@ -175,8 +182,16 @@ def _layout(lines: list[str], part: DialectPart, comment: str, quote: str, wante
     begin = part.skip or 0
     named = [] if part.header is False else _by_names(lines, candidates, comment, quote, wanted, begin, part.skip)
     layouts = named or [_by_shape(lines, separator, part, comment, quote) for separator in candidates]
-    # More lines of the header's length are better, then more columns, then the usual separator.
-    return max(layouts, key=lambda one: (*_agreement(lines, one, comment, quote), -candidates.index(one.separator)))
+    # More lines of the header's length are better, then more numbers, more columns, the usual separator.
+    # A single column agrees with everything, so without a name that is no sign of it.
+    return max(
+        layouts,
+        key=lambda one: (
+            *(_agreement(lines, one, comment, quote) if named or len(one.columns) > 1 else (0.0, 0.0)),
+            len(one.columns),
+            -candidates.index(one.separator),
+        ),
+    )
 
 
 def _by_names(
@@ -210,11 +225,12 @@ def _by_shape(lines: list[str], separator: str, part: DialectPart, comment: str,
     return _Layout(separator, cells, begin + index + 1, begin + index + 1)
 
 
-def _agreement(lines: list[str], layout: _Layout, comment: str, quote: str) -> tuple[float, int]:
+def _agreement(lines: list[str], layout: _Layout, comment: str, quote: str) -> tuple[float, float]:
+    """Shares, in tenths: of the lines after the header that have as many cells; of their cells that are numbers."""
     rows = _rows(lines[layout.first :], layout.separator, comment, quote)[:SAMPLE]
     same = sum(len(cells) == len(layout.columns) for _, cells in rows)
-    several = len(layout.columns) > 1
-    return (round(same / max(len(rows), 1), 1) * several, len(layout.columns))
+    every = [cell for _, cells in rows for cell in cells]
+    return round(same / max(len(rows), 1), 1), round(sum(map(numerals.is_number, every)) / max(len(every), 1), 1)
 
 
 def _unit_rows(rows: list[list[str]], layout: _Layout, wanted: Sequence[str], missing: Sequence) -> int:
@@ -225,7 +241,9 @@ def _unit_rows(rows: list[list[str]], layout: _Layout, wanted: Sequence[str], mi
     words = {str(word).strip().lower() for word in missing} | numerals.MISSING
 
     def speaks(cells: list[str]) -> bool:
-        looked = [cells[index] for index in chosen if index < len(cells)]
+        if len(cells) != len(layout.columns):
+            return False
+        looked = [cells[index] for index in chosen]
         return (
             any(looked)
             and not any(cell[:1].isdigit() or numerals.is_number(cell) for cell in looked)

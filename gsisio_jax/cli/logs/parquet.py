@@ -39,7 +39,7 @@ def parquet_blocks(
     chosen = [stored[one] for one in wanted if one in stored]
     try:
         for batch in file.iter_batches(batch_size=size, columns=chosen):
-            frame = batch.to_pandas(ignore_metadata=True) if chosen else None
+            frame = batch.to_pandas(ignore_metadata=True)
             rows = np.arange(done + 1, done + 1 + batch.num_rows)
             columns: dict[str, Any] = {one: frame[stored[one]] for one in wanted if one in stored}
             if span and span[0] in wanted:

@@ -6,6 +6,7 @@ too short. So lines are measured first, on bytes, and a block that the parser re
 
 from __future__ import annotations
 
+import csv
 import io
 import re
 from collections.abc import Iterator, Sequence
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..._extras import need
-from ..errors import UserError
+from ..errors import UserError, reason
 from .cells import Block, Cells, check_columns
 from .dialect import Dialect
 from .text import BLOCK, blocks_of_lines, opened
@@ -72,7 +73,7 @@ class Parser:
         self._comment = None
         if dialect.comment:
             quote, mark = re.escape(dialect.quote), re.escape(dialect.comment)
-            self._comment = re.compile(rf"({quote}[^{quote}]*{quote})|{mark}[^\n]*")
+            self._comment = re.compile(rf"({quote}[^{quote}\n]*{quote})|{mark}[^\n]*")
 
     def parse(self, line: int, text: str) -> Block:
         """Columns of some whole lines.
@@ -87,7 +88,7 @@ class Parser:
         # Only a strict look at every cell tells 1,234 from 1,23 where commas stand between thousands.
         frame = None if self.dialect.thousands else self._fast(data)
         if frame is None:
-            frame = self.frame(data, dict.fromkeys(self.wanted, object))
+            frame = self._as_text(data, dict.fromkeys(self.wanted, object), rows)
         columns = {one: frame[index].to_numpy() for index, one in self.wanted.items()}
         block = Block(self.name, columns, rows)
         for index, one in self.wanted.items():
@@ -99,7 +100,7 @@ class Parser:
         """All columns of some whole lines as text, by position, and the numbers of the rows."""
         data, rows = self._rows(line, text)
         everything = dict.fromkeys(range(len(self.dialect.columns)), object)
-        return self.frame(data, everything), rows
+        return self._as_text(data, everything, rows), rows
 
     def _rows(self, line: int, text: str) -> tuple[bytes, np.ndarray]:
         """The lines that are rows, and their numbers; comments and what comes before the first row are dropped."""
@@ -115,36 +116,10 @@ class Parser:
 
     def _measured(self, data: bytes, line: int) -> tuple[bytes, np.ndarray]:
         """Drop empty lines; complain about a line with too many or too few cells."""
-        separator, width = ord(self.dialect.separator), len(self.dialect.columns)
-        bytes_ = np.frombuffer(data, np.uint8)
-        ends = np.flatnonzero(bytes_ == _LINE_FEED)
-        rows = line + np.arange(len(ends))
-        if self.dialect.separator == " ":
-            gap = (bytes_ == _SPACE) | (bytes_ == _TAB) | (bytes_ == _LINE_FEED)
-            marks = ~gap
-            marks[1:] &= gap[:-1]  # cells begin after a gap
-        else:
-            marks = bytes_ == separator
-        if self.dialect.quote.encode() in data:
-            inside = np.cumsum(bytes_ == ord(self.dialect.quote), dtype=np.uint8) % 2 == 1
-            # A cell in quotes begins with its quote, which is the first byte that counts as inside.
-            marks &= ~inside | (bytes_ == ord(self.dialect.quote))
-            kept = ~inside[ends]
-            ends, rows = ends[kept], rows[kept]
-        starts = np.concatenate([[0], ends[:-1] + 1])
-        cells = np.add.reduceat(marks, starts, dtype=np.int32) + (self.dialect.separator != " ")
-        if width > 1:
-            # A table of one column may have empty cells; elsewhere a line without anything is no row.
-            empty = np.zeros(len(ends), bool)
-            for index in np.flatnonzero(cells <= 1):
-                empty[index] = not data[starts[index] : ends[index]].strip()
-            if empty.any():
-                data = bytes_[np.repeat(~empty, ends - starts + 1)].tobytes()
-                starts, ends, rows, cells = starts[~empty], ends[~empty], rows[~empty], cells[~empty]
-        else:
-            cells = np.maximum(cells, 1)
-        closing = (cells == width + 1) & (bytes_[ends - 1] == separator)  # 1,2,3, has no fourth cell
-        wrong = (cells != width) & ~closing
+        width = len(self.dialect.columns)
+        quoted = self.dialect.quote.encode() in data
+        cells, rows, surplus, data = self._counted_one_by_one(data, line) if quoted else self._counted(data, line)
+        wrong = (cells != width) & ~surplus
         if wrong.any():
             bad = int(np.argmax(wrong))
             raise UserError(
@@ -153,6 +128,55 @@ class Parser:
             )
         return data, rows
 
+    def _counted(self, data: bytes, line: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, bytes]:
+        """Cells of every line, numbers of the lines, whether there is one empty cell too many, lines that are rows."""
+        separator, width = ord(self.dialect.separator), len(self.dialect.columns)
+        bytes_ = np.frombuffer(data, np.uint8)
+        ends = np.flatnonzero(bytes_ == _LINE_FEED)
+        starts = np.concatenate([[0], ends[:-1] + 1])
+        if self.dialect.separator == " ":
+            gap = (bytes_ == _SPACE) | (bytes_ == _TAB) | (bytes_ == _LINE_FEED)
+            marks = ~gap
+            marks[1:] &= gap[:-1]  # cells begin after a gap
+            cells = np.add.reduceat(marks, starts, dtype=np.int32)
+        else:
+            cells = np.add.reduceat(bytes_ == separator, starts, dtype=np.int32) + 1
+        kept = np.ones(len(ends), bool)
+        if width > 1:
+            # A table of one column may have empty cells; elsewhere a line without anything is no row.
+            for index in np.flatnonzero(cells <= 1):
+                kept[index] = bool(data[starts[index] : ends[index]].strip())
+            if not kept.all():
+                data = bytes_[np.repeat(kept, ends - starts + 1)].tobytes()
+        surplus = (cells == width + 1) & (bytes_[ends - 1] == separator)  # 1,2,3, has no fourth cell
+        return np.maximum(cells, 1)[kept], (line + np.arange(len(ends)))[kept], surplus[kept], data
+
+    def _counted_one_by_one(self, data: bytes, line: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, bytes]:
+        """The same where cells stand in quotes, which may hold separators and line breaks; a row of several lines is
+        named by its last one."""
+        text, width = data.decode("utf-8", "surrogatepass"), len(self.dialect.columns)
+        if self.dialect.separator == " ":
+            text = "\n".join(" ".join(line.split()) for line in text.split("\n"))
+        reader = csv.reader(
+            io.StringIO(text),
+            delimiter=self.dialect.separator,
+            quotechar=self.dialect.quote,
+            skipinitialspace=True,
+        )
+        cells, rows, surplus = [], [], []
+        try:
+            for record in reader:
+                if width > 1 and not any(cell.strip() for cell in record) and len(record) <= 1:
+                    continue
+                cells.append(max(len(record), 1))
+                rows.append(line + reader.line_num - 1)
+                surplus.append(len(record) == width + 1 and not record[-1])
+        except csv.Error as error:
+            raise UserError(f"{self.name}: row {line + reader.line_num - 1}: {reason(error)}") from error
+        if width > 1:
+            data = re.sub(rb"(?m)^[ \t]*\n", b"", data)
+        return np.array(cells, np.int32), np.array(rows, np.int64), np.array(surplus, bool), data
+
     def _fast(self, data: bytes) -> Any:
         """Floats by the C parser; None where it meets a cell that it cannot read."""
         types = {index: object if index in self.as_text else np.float64 for index in self.wanted}
@@ -160,6 +184,12 @@ class Parser:
             return self.frame(data, types)
         except ValueError:
             return None
+
+    def _as_text(self, data: bytes, types: dict[int, Any], rows: np.ndarray) -> Any:
+        try:
+            return self.frame(data, types)
+        except ValueError as error:
+            raise UserError(f"{self.name}: rows {rows[0]} to {rows[-1]} cannot be read: {reason(error)}") from error
 
     def frame(self, data: bytes, types: dict[int, Any]) -> Any:
         """Columns by their position, each of its type: floats with NaN where missing, or text."""

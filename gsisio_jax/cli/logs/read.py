@@ -79,12 +79,13 @@ def open_blocks(
 def as_text(part: TablePart, dialect: Dialect | None) -> list[str]:
     """The clock where its cells are not numbers of a text file, so that they are kept as they are."""
     clock = part.time
-    if clock is None or clock.column in (*part.y, *part.u):
+    if clock is None:
         return []
-    if dialect is None or clock.format is not None or clock.unit == "iso8601":
-        return [clock.column]
-    dates = clock.unit is None and any(map(is_date, dialect.cells(clock.column)[:1]))
-    return [clock.column] if dates else []
+    names = [name for name in clock.column if name not in (*part.y, *part.u)]
+    if dialect is None or clock.format is not None or clock.unit == "iso8601" or len(clock.column) > 1:
+        return names
+    dates = clock.unit is None and any(is_date(cell) for name in names for cell in dialect.cells(name))
+    return names if dates else []
 
 
 def joined(blocks: Iterator[Block]) -> Iterator[Block]:

@@ -80,18 +80,19 @@ class StampReader:
         Raises:
             UserError: a cell is no number or no date; a local time that its zone has twice or not at all.
         """
-        name = self.part.column
-        column = block.columns[name]
+        column, name = self._column(block)
 
         def place(index: int) -> str:
             return f"{block.row(index)}, column '{name}'"
 
-        self.dates = self.dates or self.part.format is not None or self.part.unit == "iso8601" or is_date_column(column)
+        if not self.dates:
+            said = self.part.format is not None or self.part.unit == "iso8601"
+            self.dates = said or (self.part.unit is None and is_date_column(column))
         if self.dates:
             values, empty = self._dates(column, place)
             scale = 1e9
         else:
-            values, empty = self._numbers(block)
+            values, empty = self._numbers(block, column, name)
             if self.part.unit == "epoch" and self.origin is None and not empty.all():
                 self.unit = _epoch_unit(float(values[~empty][0]), place(int(np.argmin(empty))))
             scale = PER_SECOND[self.unit]
@@ -108,8 +109,17 @@ class StampReader:
 
         return Stamps(since, time, resolution, show, place)
 
-    def _numbers(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
-        column = block.columns[self.part.column]
+    def _column(self, block: Block) -> tuple[Any, str]:
+        """The cells and the name of the clock; cells of several columns with blanks between them."""
+        names = self.part.column
+        columns = [block.columns[name] for name in names]
+        if len(columns) == 1:
+            return columns[0], names[0]
+        rows = zip(*([str(cell).strip() for cell in column] for column in columns), strict=True)
+        cells = ["" if "" in row or "nan" in row or "None" in row else " ".join(row) for row in rows]
+        return np.array(cells, dtype=object), "', '".join(names)
+
+    def _numbers(self, block: Block, column: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
         if getattr(getattr(column, "dtype", None), "kind", "O") in "iu":
             # Whole numbers beyond 2^53 (nanoseconds since 1970) stay exact until the first one is taken off.
             values = np.asarray(column)
@@ -119,7 +129,7 @@ class StampReader:
                     break
             else:
                 return signed, np.zeros(len(signed), bool)
-        values = Cells(self.missing).numbers(block, self.part.column)
+        values = Cells(self.missing).numbers(Block(block.name, {name: column}, block.rows), name)
         return values, np.isnan(values)
 
     def _dates(self, column: Any, place: Callable[[int], str]) -> tuple[np.ndarray, np.ndarray]:

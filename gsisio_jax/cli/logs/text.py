@@ -9,6 +9,7 @@ import gzip
 import io
 import lzma
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -18,6 +19,7 @@ from ..errors import UserError, reason
 
 HEAD = 1 << 18  # bytes that are looked at to find the dialect
 BLOCK = 1 << 24  # characters that are parsed at a time
+QUOTED_LINES = 1000  # of one cell, at most
 _MAGIC = {
     b"\x1f\x8b": "gz",
     b"PK\x03\x04": "zip",
@@ -82,7 +84,7 @@ def opened(path: Path, compression: str | None = None) -> Iterator[IO[bytes]]:
                 compression = find_compression(raw.read(8))
                 raw.seek(0)
             yield _decompressed(raw, compression, path.name, stack)
-    except (EOFError, zipfile.BadZipFile, lzma.LZMAError, gzip.BadGzipFile, zipfile.error) as error:
+    except (EOFError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, gzip.BadGzipFile) as error:
         raise UserError(f"{path.name}: the compressed file is damaged or ends too early: {reason(error)}") from error
     except OSError as error:
         raise UserError(f"{path}: cannot read the table: {reason(error)}") from error
@@ -166,7 +168,13 @@ def end_of_lines(text: str, quote: str) -> int:
     >>> end_of_lines('1,2' + chr(10) + '3,"a' + chr(10), '"')
     4
     """
-    cut = text.rfind("\n") + 1
-    while cut and text.count(quote, 0, cut) % 2:
-        cut = text.rfind("\n", 0, cut - 1) + 1
-    return cut
+    end = cut = text.rfind("\n") + 1
+    odd = text.count(quote, 0, cut) % 2
+    for _ in range(QUOTED_LINES):
+        if not odd or not cut:
+            return cut
+        before = text.rfind("\n", 0, cut - 1) + 1
+        odd ^= text.count(quote, before, cut) % 2
+        cut = before
+    # No cell is as long as that: somewhere a quote stands for itself, as in 5" pipe.
+    return end

@@ -59,10 +59,10 @@ def transformed(
     name = f"{path.name} after {label}"
     check_columns(name, frame.columns, part.wanted)
     # The clock stays as it is, because it may hold dates.
-    clock = None if part.time is None or part.time.column in (*part.y, *part.u) else part.time.column
+    clock = () if part.time is None else set(part.time.column).difference(part.y, part.u)
     block = Block(name, {one: frame[one] for one in part.wanted}, np.arange(1, len(frame) + 1))
     for one in part.wanted:
-        if one != clock:
+        if one not in clock:
             block.columns[one] = Cells(part.missing).numbers(block, one)
     yield block
 

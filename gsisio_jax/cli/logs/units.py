@@ -81,7 +81,7 @@ def conversion(unit: str, to: str | None = None) -> tuple[float, float]:
     to = next(iter(known)) if to is None else to
     if _dimension(to) != dimension:
         raise ValueError(
-            f'"{unit}" is a {dimension}, "{to}" a {_dimension(to)}; known for {dimension}: {", ".join(known)}'
+            f'"{unit}" is of {dimension}, "{to}" of {_dimension(to)}; known for {dimension}: {", ".join(known)}'
         )
     (factor, offset), (back, shift) = _pair(known[unit]), _pair(known[to])
     return factor / back, (offset - shift) / back
