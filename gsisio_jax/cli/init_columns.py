@@ -106,7 +106,7 @@ def _stands_for_missing(value: float) -> bool:
 def _sentinels(values: np.ndarray) -> tuple[float, ...]:
     """Numbers such as -9999 or 32767, at an end and far from all others, that are there more than once."""
     found: list[float] = []
-    for end in (np.min, np.max):
+    for end in (np.min, np.max, np.min):  # the one at the far end may hide the other
         rest = values[~np.isin(values, found)]
         if len(rest) < 3:
             break
@@ -116,4 +116,4 @@ def _sentinels(values: np.ndarray) -> tuple[float, ...]:
             near = min(abs(others.min() - value), abs(others.max() - value))
             if near > FAR * (others.max() - others.min()) or abs(value) > FAR * np.abs(others).max():
                 found.append(value)
-    return tuple(found)
+    return tuple(sorted(found))

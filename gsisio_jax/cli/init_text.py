@@ -168,7 +168,8 @@ def _found(dialect: str) -> str:
 def _clock(clock: Clocked | None) -> str:
     if clock is None:
         return (
-            '# No clock was found: rows are one sample time apart. With one: time = "column".\n'
+            "# No clock was found, so rows are one sample time apart. Where a column is one, say which and how:\n"
+            '# time = "a", or {column = "a", unit = "ms"}, or {column = ["a", "b"], format = "%d.%m.%Y %H:%M:%S"}\n'
             'sample_time = "FILL_IN"           # seconds'
         )
     unit = "" if clock.unit is None else f", unit = {_quoted(clock.unit)}"
