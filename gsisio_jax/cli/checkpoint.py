@@ -34,7 +34,7 @@ class Digest:
     def add(self, time: np.ndarray, y: np.ndarray, u: np.ndarray | None) -> None:
         for part, values in zip(self._parts, (time, y, u), strict=True):
             if values is not None:
-                part.update(np.ascontiguousarray(values, dtype=np.float64))
+                part.update(np.ascontiguousarray(values, dtype=np.float64).data)
 
     def __str__(self) -> str:
         return "".join(part.hexdigest() for part in self._parts)
@@ -106,7 +106,7 @@ class Checkpoint:
         """Rows first, then what refers to them; each whole or not at all."""
         boxes.sync()
         leaves = [np.asarray(leaf) for leaf in jax.device_get(jax.tree.leaves(carry))]
-        named = {f"carry_{index}": leaf for index, leaf in enumerate(leaves)}
+        named: dict[str, Any] = {f"carry_{index}": leaf for index, leaf in enumerate(leaves)}
         stream = io.BytesIO()
         np.savez(stream, rows=len(boxes), identity=identity, digest=str(digest), **named)
         put(self.file, stream.getvalue())

@@ -72,7 +72,8 @@ class Stepper:
     """
 
     def __init__(self, problem: Problem, on_conflict: OnConflict):
-        self.problem, self.on_conflict = problem, on_conflict
+        self.problem = problem
+        self.on_conflict: OnConflict = on_conflict
         self.observer = design(problem)
         system = problem.system
         self.kind = record_type(system.n, system.p, system.l)

@@ -19,6 +19,7 @@ from .._extras import need
 from .errors import UserError, reason
 
 CHUNK = 1 << 16  # rows of a chunk of a NetCDF file that is written part by part
+LINES = 1 << 14  # of a CSV file that are text in memory
 
 
 def check_writable(out: Path, names: list[str]) -> None:
@@ -114,12 +115,17 @@ def write_csv(datasets: Iterable[Any], path: Path) -> None:
             names = ["time", *bounds, "status"]
             if stream.tell() == 0:
                 stream.write(",".join(names) + "\n")
-            for row in zip(*(dataset[name].values.tolist() for name in names), strict=True):
-                stream.write(",".join(map(_cell, row)) + "\n")
+            for begin in range(0, dataset.sizes["time"], LINES):
+                columns = [_cells(dataset[name].values[begin : begin + LINES]) for name in names]
+                stream.writelines(f"{line}\n" for line in map(",".join, zip(*columns, strict=True)))
 
 
-def _cell(value: float | int) -> str:
-    return "" if isinstance(value, float) and np.isnan(value) else repr(value)
+def _cells(values: np.ndarray) -> list[str]:
+    """Numbers as they read back exactly; nothing where there is none."""
+    cells = list(map(repr, values.tolist()))
+    for index in np.flatnonzero(np.isnan(values)):
+        cells[index] = ""
+    return cells
 
 
 def _make_folder(out: Path) -> list[Path]:

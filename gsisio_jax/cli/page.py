@@ -141,7 +141,7 @@ def _alarms(totals: Totals) -> list[str]:
         (
             seconds(alarm["time"]),
             str(alarm["step"]),
-            _SOURCES.get(alarm["kind"], alarm["kind"]),
+            _SOURCES.get(alarm["kind"]) or str(alarm["kind"]),
             short(-alarm["gap"]),
             alarm["text"],
         )

@@ -108,7 +108,8 @@ class _Runner:
         boxes: Boxes,
         checkpoint: Checkpoint | None,
     ):
-        self.problem, self.observer, self.on_conflict, self.chunk = problem, observer, on_conflict, chunk
+        self.problem, self.observer, self.chunk = problem, observer, chunk
+        self.on_conflict: OnConflict = on_conflict
         self.boxes, self.checkpoint, self.digest = boxes, checkpoint, Digest()
         self.carry: Any = None
         self.compile_seconds = 0.0

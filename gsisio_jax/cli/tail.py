@@ -103,7 +103,7 @@ class Tail:
     def _bytes(self) -> Iterator[bytes]:
         """What is new; empty once, at the end of standard input."""
         if self._path is None:
-            stream = sys.stdin.buffer
+            stream: Any = sys.stdin.buffer
             while data := stream.read1(READ):
                 yield data
             yield b""

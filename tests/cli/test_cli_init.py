@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import tomllib
 
 import numpy as np
@@ -32,6 +33,7 @@ def pump(rows=60):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "plant", raising=False)  # of another test; modules stay imported
     return tmp_path
 
 
