@@ -76,6 +76,9 @@ def estimate(options: argparse.Namespace, path: Path, config: Config, wanted: Ta
                 "interrupted, no file was written; the same command with --resume goes on after step "
                 f"{checkpoint.rows:,}"
             ) from error
+        except OSError as error:
+            checkpoint.leave()
+            raise UserError(f"cannot write to {out}: {reason(error)}") from error
         except BaseException:
             checkpoint.leave()
             raise

@@ -11,7 +11,7 @@ import xarray
 from gsisio_jax.cli import boxes, checkpoint, run
 from gsisio_jax.cli.boxes import Boxes, record_type
 from gsisio_jax.cli.labelled import _hulls
-from gsisio_jax.cli.logs import Table
+from gsisio_jax.cli.logs import Table, TablePart, TableStream, parser, read_table
 from gsisio_jax.cli.run import chunks
 
 FILES = ("boxes.csv", "cart.nc", "cart.png", "cart.html")
@@ -93,8 +93,6 @@ def test_resume_refuses_another_run(project, short_memory, monkeypatch):
 
 
 def test_a_bad_cell_far_down_keeps_what_comes_before(project, short_memory, monkeypatch):
-    from gsisio_jax.cli.logs import parser
-
     monkeypatch.setattr(parser.text_blocks, "__defaults__", ((), 300))
     lines = (project.folder / "cart.csv").read_text().splitlines()
     good = lines[35]
@@ -169,3 +167,25 @@ def test_hulls_hold_every_box(tmp_path, monkeypatch):
         seen = mine["y"][~np.isnan(mine["y"])]
         expected = [seen.min(), seen.max()] if len(seen) else [np.nan, np.nan]
         np.testing.assert_array_equal(pair["y"][:, 0], expected)
+
+
+@pytest.mark.parametrize("size", [15, 40, 10_000])
+@pytest.mark.parametrize("extra", [{}, {"on_duplicate": "mean"}, {"on_unsorted": "sort", "on_duplicate": "last"}])
+def test_pieces_of_a_file_are_the_whole_file(tmp_path, monkeypatch, size, extra):
+    """Gaps, doubles and disorder across the borders of blocks."""
+    stamps = ["0", "0.1", "0.2", "0.5", "0.6", "1.1", "1.2"]
+    if "on_duplicate" in extra:
+        stamps[3:3] = ["0.2", "0.2"]
+    if "on_unsorted" in extra:
+        stamps[0], stamps[-2] = stamps[-2], stamps[0]
+    path = tmp_path / "log.csv"
+    path.write_text("t,a\n" + "".join(f"{stamp},{value}\n" for value, stamp in enumerate(stamps)))
+    part = TablePart.model_validate({"file": "log.csv", "time": "t", "sample_time": 0.1, "y": ["a"], **extra})
+    whole = read_table(path, part)
+    monkeypatch.setattr(parser.text_blocks, "__defaults__", ((), size))
+    stream = TableStream(path, part)
+    found = run.joined(list(stream))
+    np.testing.assert_array_equal(found.time, whole.time)
+    np.testing.assert_array_equal(found.y, whole.y)
+    assert stream.notes == whole.notes
+    assert stream.total == len(stamps) + 1  # lines, the header included
