@@ -108,6 +108,7 @@ def test_report_and_json(project):
     assert float(alarm[3]) == pytest.approx(-found["alarms"][0]["gap"], rel=1e-3)
     assert alarm[4] == found["alarms"][0]["text"]
     assert "Cart &lt;i&gt;&amp;amp;&lt;/i&gt; &quot;cable&quot;" in text
+    assert "<i>" not in text
     assert "1 certified alarm<" in text
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import UserError
 from .stamps import NAMES, Stamps, likely_unit
 
-MAXIMUM_STEPS = 50_000_000
+MAXIMUM_STEPS = 50_000_000  # of one gap, and of a file that is read as a whole
 NEAR = 8  # steps between two rows that still tell how long a step is
 DRIFT = 2e-3  # how far the mean time between rows may be from sample_time: 0.0333 for 1/30 passes, 0.033 does not
 
@@ -30,9 +30,14 @@ class Clock:
     Attributes:
         sample_time: seconds between two points of the grid.
         tolerance: seconds that a stamp may be off its point; a tenth of the sample time by default.
-        unit: of the clock, for messages.
+        unit: of the numbers of the clock, for messages; empty where it shows dates.
         found: whether `sample_time` was found in the times, so that it has no rounding to be held against them.
         sparse: whether most points of the grid may be without a row.
+        rows, index, start, since, shown: points that have a row, the last one, seconds of the first and the last row,
+            text of the last stamp.
+        gaps, jitter: for `describe`.
+        near_time, near_steps, runs: seconds and steps between neighbouring rows, and how often such a run began.
+        usual: median of the first differences, seconds.
     """
 
     sample_time: float
@@ -89,14 +94,13 @@ class Clock:
                 f'step of sample_time = {self.sample_time:g} s; set on_duplicate = "first", "last" or "mean", or '
                 "mend sample_time"
             )
-        index = self.index + np.cumsum(count)
-        if index[-1] > MAXIMUM_STEPS:
-            span = since[-1] - self.start
+        if count.max() > MAXIMUM_STEPS:
+            bad = int(np.argmax(count))
             raise UserError(
-                f"{stamps.place(len(stamps) - 1)}: the times span {span:.6g} s, more than {MAXIMUM_STEPS} steps "
-                f"of {self.sample_time:g} s; check time.unit and sample_time"
+                f"{stamps.place(bad)}: the time {stamps.show(bad)} comes more than {MAXIMUM_STEPS:,} steps of "
+                f"{self.sample_time:g} s after {self._before(stamps, bad)}; check time.unit and sample_time"
             )
-        index = index.astype(np.int64)
+        index = self.index + np.cumsum(count).astype(np.int64)
         self._no_drift(stamps, index, since - self.start, slack)
         self.gaps += int(np.count_nonzero(count > 1))
         self.jitter = max(self.jitter, float(np.abs(step - count * period).max()))
@@ -140,11 +144,10 @@ class Clock:
             return
         self.usual = float(np.median(step))
         ratio = self.usual / self.sample_time
-        unit = likely_unit(ratio, self.unit)
+        unit = likely_unit(ratio, self.unit) if self.unit else None
         if unit is None or self.sparse or 0.5 < ratio < 2:
             return
-        per_row = self.usual / self.sample_time
-        what = f"would leave {1 - 1 / per_row:.1%} of the steps without a row" if per_row > 1 else "would merge rows"
+        what = f"would leave {1 - 1 / ratio:.1%} of the steps without a row" if ratio > 1 else "would merge rows"
         raise UserError(
             f"{stamps.place(0)}: the times differ by {self.usual:.6g} s a row, which with sample_time = "
             f'{self.sample_time:g} s {what}: {NAMES[unit]}? Set time.unit = "{unit}"'
@@ -247,7 +250,8 @@ def find_sample_time(stamps: Stamps) -> float:
         )
     runs = 1 + int(np.count_nonzero(~near))
     jitter = float(deviation[good].max())
-    return rounded(mean, max(2 * jitter, 4 * stamps.resolution) * runs / float(count[near].sum()))
+    error = max(2 * jitter, 4 * stamps.resolution, 1e-12 * mean)
+    return rounded(mean, error * runs / float(count[near].sum()))
 
 
 def rounded(value: float, error: float) -> float:

@@ -18,10 +18,11 @@ import numpy as np
 from ..._extras import need
 from ..errors import UserError, reason
 from .cells import Block, Cells, check_columns
-from .dialect import Dialect
+from .dialect import Dialect, without_comments
 from .text import BLOCK, blocks_of_lines, opened
 
 _LINE_FEED, _SPACE, _TAB = b"\n \t"
+_NO_ROW = b"\x1a"  # in place of a comment: an empty line is an empty cell where there is one column
 
 
 def text_blocks(
@@ -70,10 +71,6 @@ class Parser:
         self.as_text = {index for index, one in self.wanted.items() if one in as_text}
         self.cells = Cells(missing, dialect.decimal, dialect.thousands)
         self._pandas = need("pandas", extra="cli", purpose="the command line")
-        self._comment = None
-        if dialect.comment:
-            quote, mark = re.escape(dialect.quote), re.escape(dialect.comment)
-            self._comment = re.compile(rf"({quote}[^{quote}\n]*{quote})|{mark}[^\n]*")
 
     def parse(self, line: int, text: str) -> Block:
         """Columns of some whole lines.
@@ -108,8 +105,9 @@ class Parser:
         if skipped > 0:
             lines = text.split("\n", skipped)
             text, line = lines[-1] if len(lines) > skipped else "", self.dialect.first_line
-        if self._comment is not None and self.dialect.comment in text:
-            text = self._comment.sub(lambda found: found[1] or "", text)
+        text = without_comments(text, self.dialect.comment, self.dialect.quote, alone=_NO_ROW.decode())
+        if " \n" in text:
+            text = re.sub(" +\n", "\n", text)
         if not text:
             return b"", np.empty(0, np.int64)
         return self._measured(text.encode("utf-8", "surrogatepass"), line)
@@ -142,10 +140,11 @@ class Parser:
         else:
             cells = np.add.reduceat(bytes_ == separator, starts, dtype=np.int32) + 1
         kept = np.ones(len(ends), bool)
-        if width > 1:
+        if width > 1 or _NO_ROW in data:
             # A table of one column may have empty cells; elsewhere a line without anything is no row.
+            no_rows = (b"", _NO_ROW) if width > 1 else (_NO_ROW,)
             for index in np.flatnonzero(cells <= 1):
-                kept[index] = bool(data[starts[index] : ends[index]].strip())
+                kept[index] = data[starts[index] : ends[index]].strip(b" \t") not in no_rows
             if not kept.all():
                 data = bytes_[np.repeat(kept, ends - starts + 1)].tobytes()
         surplus = (cells == width + 1) & (bytes_[ends - 1] == separator)  # 1,2,3, has no fourth cell
@@ -166,15 +165,15 @@ class Parser:
         cells, rows, surplus = [], [], []
         try:
             for record in reader:
-                if width > 1 and not any(cell.strip() for cell in record) and len(record) <= 1:
+                alone = record[0].strip() if len(record) == 1 else "" if not record else None
+                if alone == _NO_ROW.decode() or (alone == "" and width > 1):
                     continue
                 cells.append(max(len(record), 1))
                 rows.append(line + reader.line_num - 1)
                 surplus.append(len(record) == width + 1 and not record[-1])
         except csv.Error as error:
             raise UserError(f"{self.name}: row {line + reader.line_num - 1}: {reason(error)}") from error
-        if width > 1:
-            data = re.sub(rb"(?m)^[ \t]*\n", b"", data)
+        data = re.sub(rb"(?m)^[ \t]*\x1a\n" if width == 1 else rb"(?m)^[ \t]*\x1a?\n", b"", data)
         return np.array(cells, np.int32), np.array(rows, np.int64), np.array(surplus, bool), data
 
     def _fast(self, data: bytes) -> Any:
@@ -196,7 +195,8 @@ class Parser:
         space = self.dialect.separator == " "
         numbers = [index for index, kind in types.items() if kind is not object]
         # Older versions of pandas round the last digit wrongly unless they are told not to.
-        exact = {} if int(self._pandas.__version__.split(".")[0]) > 2 else {"float_precision": "round_trip"}
+        version = tuple(map(int, self._pandas.__version__.split(".")[:2]))
+        exact = {} if version >= (3, 1) else {"float_precision": "round_trip"}
         return self._pandas.read_csv(
             io.BytesIO(data),
             sep=r"\s+" if space else self.dialect.separator,

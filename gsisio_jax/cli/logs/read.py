@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import UserError
 from .cells import Block
+from .clock import MAXIMUM_STEPS
 from .config import TablePart
 from .dialect import Dialect, sniff_file
 from .parquet import parquet_blocks
@@ -59,6 +61,9 @@ def read_table(path: Path, part: TablePart, transform: Callable[[Any], Any] | No
         blocks = joined(blocks)
     reader = TableReader(path.name, part)
     found = [*map(reader.feed, blocks), reader.finish()]
+    last = max(int(rows.index[-1]) for rows in found if len(rows.index))
+    if last > MAXIMUM_STEPS:
+        raise UserError(f"{path.name}: the times span {last:,} steps, more than {MAXIMUM_STEPS:,}; check sample_time")
     return filled(found, reader.notes(dialect))
 
 

@@ -168,7 +168,7 @@ class TableReader:
                 f"table.time.tolerance = {tolerance:g} s must not exceed a quarter of the sample time that was found, "
                 f"{sample_time:g} s"
             )
-        return Clock(sample_time, tolerance, "s" if reader.dates else reader.unit, found, self.part.sparse)
+        return Clock(sample_time, tolerance, "" if reader.dates else reader.unit, found, self.part.sparse)
 
     def _columns(self, block: Block, names: list[str]) -> np.ndarray:
         """(R, len(names)) numbers in the units of the plant."""

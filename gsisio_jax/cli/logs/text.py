@@ -44,6 +44,12 @@ def find_compression(start: bytes) -> str:
     return next((name for magic, name in _MAGIC.items() if start.startswith(magic)), "none")
 
 
+def compression_of(path: Path) -> str:
+    """`find_compression` of a file."""
+    with opened(path, "none") as stream:
+        return find_compression(stream.read(8))
+
+
 def find_encoding(head: bytes) -> str:
     """UTF-8 where the bytes are UTF-8, UTF-16 by its mark or by its zero bytes, else the code page of Windows.
 
@@ -67,12 +73,12 @@ def find_encoding(head: bytes) -> str:
 
 
 @contextlib.contextmanager
-def opened(path: Path, compression: str | None = None) -> Iterator[IO[bytes]]:
+def opened(path: Path, compression: str) -> Iterator[IO[bytes]]:
     """The decompressed bytes of a file.
 
     Args:
         path: the file.
-        compression: of `find_compression`; found where left out.
+        compression: as `compression_of` finds it.
 
     Raises:
         UserError: the file cannot be opened, or what is read inside the ``with`` block is damaged.
@@ -80,9 +86,6 @@ def opened(path: Path, compression: str | None = None) -> Iterator[IO[bytes]]:
     try:
         with contextlib.ExitStack() as stack:
             raw: Any = stack.enter_context(open(path, "rb"))
-            if compression is None:
-                compression = find_compression(raw.read(8))
-                raw.seek(0)
             yield _decompressed(raw, compression, path.name, stack)
     except (EOFError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, gzip.BadGzipFile) as error:
         raise UserError(f"{path.name}: the compressed file is damaged or ends too early: {reason(error)}") from error
@@ -148,12 +151,15 @@ def blocks_of_lines(
                     f"{name}: not {encoding} text near line {line + rest.count(chr(10))}: {reason(error)}; set "
                     'table.dialect.encoding, for example "cp1252"'
                 ) from error
-            text = rest + part if part else rest + ("\n" if rest and not rest.endswith("\n") else "")
-            cut = len(text) if not part else end_of_lines(text, quote)
-            if cut:
-                yield line, text[:cut]
-                line += text.count("\n", 0, cut)
-            rest = text[cut:]
+            text = rest + part
+            cut = end_of_lines(text, quote) if part else len(text)
+            # Empty lines wait for what follows them: at the end of the file they are no rows, not even of one column.
+            lines = text[:cut].rstrip("\n")
+            if lines:
+                yield line, lines + "\n"
+                line += lines.count("\n") + 1
+                text = text[len(lines) + 1 :]
+            rest = text
             if not part:
                 return
     finally:

@@ -78,6 +78,7 @@ TEXTS = {
     "iso_local.csv": clock("2024-05-01 12:00:00", "2024-05-01 12:00:01", "2024-05-01 12:00:03"),
     "iso_mixed.csv": clock("2024-05-01T10:00:00Z", "2024-05-01T10:00:01"),
     "iso_wrong.csv": clock("2024-05-01T10:00:00", "2024-05-32T10:00:01"),
+    "iso_slow.csv": clock("2024-05-01T10:00:00", "2024-05-01T10:16:40", "2024-05-01T10:33:20"),
     "clocks_go_forward.csv": clock("2024-03-31 01:59:59", "2024-03-31 03:00:00", "2024-03-31 03:00:01"),
     "clocks_go_back.csv": clock("2024-10-27 01:59:59", "2024-10-27 02:00:00", "2024-10-27 02:00:01"),
     "german_date.csv": clock("01.05.2024 12:00:00", "01.05.2024 12:00:01", "01.05.2024 12:00:03"),
@@ -97,6 +98,11 @@ TEXTS = {
     "rare_rows.csv": clock("0", "5", "10", "20"),
     "one_long_gap.csv": clock("0", "1", "2", "50", "51"),
     "no_clock.csv": "a\n1\n2\n\n4\n",
+    "no_clock_comments.csv": "# by hand\na\n1\n# break\n2 # two\n\n  # and\n4\n\n\n",
+    "no_clock_quotes.csv": '# by hand\n"a"\n"1"\n# break\n"2" # two\n\n"4"\n',
+    "trailing_comma_in_header.csv": PLAIN.replace("b\n", "b,\n"),
+    "trailing_blanks.csv": PLAIN.replace("\n", ", \n"),
+    "control_z.csv": PLAIN + "\x1a",
     "raw_counts.csv": "t,p,angle,speed,temp\n0,100,180,36,20\n1,200,-90,72,-40\n",
 }  # fmt: skip
 BYTES = {

@@ -162,6 +162,15 @@ def test_time_steps_are_those_to_the_next_row(steps, data):
     assert table.u[-1, 1] == table.u[-2, 1]
 
 
+@pytest.mark.parametrize(("unit", "second"), PER_SECOND.items())
+def test_the_unit_of_an_epoch_is_told_by_its_size(unit, second):
+    values = (1_714_557_600 + np.arange(4)) * int(second)
+    table, reader = read([block(values)], sample_time=1.0, time={"column": "t", "unit": "epoch"})
+    assert reader.stamps is not None
+    assert reader.stamps.unit == unit
+    np.testing.assert_array_equal(table.time, 1_714_557_600 + np.arange(4))
+
+
 def test_a_clock_goes_on_where_a_copy_of_it_was():
     from dataclasses import asdict
 

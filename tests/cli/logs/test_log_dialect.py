@@ -96,6 +96,18 @@ def replace_compression(log):
     return log | {"compression": "none"}
 
 
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(st.lists(st.one_of(st.integers(0, 9), st.none()), max_size=12), st.integers(0, 3), st.integers(1, 9))
+def test_empty_lines_of_one_column_are_cells_but_not_at_the_end(tmp_path, cells, spare, size):
+    path = tmp_path / "log.csv"
+    cells = [*cells, 7]
+    path.write_text("a\n" + "".join(f"{'' if cell is None else cell}\n" for cell in cells) + "\n" * spare)
+    blocks = list(text_blocks(path, sniff_file(path, DialectPart(), ["a"]), ["a"], (), size=size))
+    found = np.concatenate([block.columns["a"] for block in blocks])
+    np.testing.assert_array_equal(found, [np.nan if cell is None else cell for cell in cells])
+    np.testing.assert_array_equal(np.concatenate([block.rows for block in blocks]), 2 + np.arange(len(cells)))
+
+
 @settings(deadline=None)
 @given(st.text(alphabet='1,"\n', max_size=60))
 def test_blocks_cut_no_cell(text):
