@@ -60,8 +60,8 @@ def find(cells: Iterable[str], separator: str, decimal: str | None, thousands: s
     Raises:
         ValueError: every number with a comma could be a decimal or a thousand, as 1,234 could.
 
-    >>> find(["1.234,5", "2"], ";", None, None)
-    (',', '.')
+    >>> find(["1.234,5", "2"], ";", None, None), find(["0,125", "1,250"], ";", None, None)
+    ((',', '.'), (',', ''))
     """
     cells = {cell.replace("\u00a0", " ").replace("\u202f", " ") for cell in cells}
     if decimal is not None and thousands is not None:
