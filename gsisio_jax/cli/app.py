@@ -139,7 +139,6 @@ def _estimate(options: argparse.Namespace) -> int:
         return follow(options, path, config, config.table)
     if options.table == "-":
         raise UserError("standard input (-) is read as it comes: add --follow")
-    need("matplotlib", extra="plot", purpose="drawing the picture")
     from .estimate import estimate
 
     return estimate(options, path, config, config.table)

@@ -44,7 +44,8 @@ def identity(observer: Any, problem: Problem, on_conflict: str, chunk: int) -> s
     """What two runs must share for one to go on where the other stopped.
 
     All numbers of the observer and of the initial box, the source files of f and g, what the configuration hands to the
-    function that makes the system, and the version of the library.
+    function that makes the system, and the version of the library. A number that f takes from a third file is not seen,
+    unless the design depends on it.
     """
     found = hashlib.blake2b(digest_size=16)
     for leaf in jax.tree.leaves((observer, problem.initial)):

@@ -39,12 +39,8 @@ def follow(options: argparse.Namespace, path: Path, config: Config, part: TableP
         The exit code: 0 at the end of standard input, 130 after Ctrl-C, 143 after SIGTERM.
     """
     _check(options, path, part)
-    source = (
-        None
-        if options.table == "-" or (options.table is None and part.file == "-")
-        else table_path(options, path, part)
-    )
-    tail = Tail(source, part)
+    piped = (part.file if options.table is None else options.table) == "-"
+    tail = Tail(None if piped else table_path(options, path, part), part)
     steps = 0
     try:
         with importable(path.parent), stoppable(lambda: "gsisio: interrupted"):

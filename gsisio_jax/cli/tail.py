@@ -61,7 +61,7 @@ class Tail:
                 data, ended = head, not data
             else:
                 ended = not data
-            text = rest + self._decoded(decoder, data, ended, line)
+            text = (rest + self._decoded(decoder, data, ended, line)).replace("\r\n", "\n")
             if ended and text and not text.endswith("\n"):
                 text += "\n"
             cut = len(text) if ended else end_of_lines(text, parser.dialect.quote)
@@ -91,14 +91,12 @@ class Tail:
 
     def _decoded(self, decoder: Any, data: bytes, ended: bool, line: int) -> str:
         try:
-            text = decoder.decode(data, final=ended)
+            return decoder.decode(data, final=ended)
         except UnicodeError as error:
             encoding = self.dialect and self.dialect.encoding
             raise UserError(
                 f"{self.name}: not {encoding} text after line {line}: {reason(error)}; set table.dialect.encoding"
             ) from error
-        # A carriage return at the end of what is there may be half of a line end; the parser drops it with the cell.
-        return text.replace("\r\n", "\n")
 
     def _bytes(self) -> Iterator[bytes]:
         """What is new; empty once, at the end of standard input."""
