@@ -67,7 +67,8 @@ def to_dataset(
     variables: dict[str, Any] = {}
     for index, (name, unit) in enumerate(zip(state_names, state_units, strict=True)):
         _add_bounds(variables, name, unit, "state", np.asarray(est.state.lower), np.asarray(est.state.upper), index)
-    last = np.full((1, p), np.nan)
+    # Part of a longer record knows its last input too.
+    last = np.full((steps - len(est.input.lower), p), np.nan)
     lower, upper = (np.concatenate([np.asarray(side), last]) for side in (est.input.lower, est.input.upper))
     for index, (name, unit) in enumerate(zip(input_names, input_units, strict=True)):
         _add_bounds(variables, name, unit, "unknown input", lower, upper, index)

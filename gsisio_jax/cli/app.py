@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from .._extras import MissingExtra, need
 from ..scalar.options import use_flags
-from .errors import UserError, reason
-from .help import EXAMPLES, MONTE_CARLO, SWEEP
+from .errors import Interrupted, UserError, reason
+from .help import EXAMPLES, INIT, MONTE_CARLO, SWEEP
+from .stopping import exit_code
 
 if TYPE_CHECKING:
     from .config import Config
-    from .problem import Problem
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,11 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of a pipe went away (`gsisio design x | head`); nothing is left to say, also not at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         if options.debug:
             raise
-        print("gsisio: interrupted, no file was written", file=sys.stderr)
-        return 130
+        print(
+            f"gsisio: {stop if isinstance(stop, Interrupted) else 'interrupted, no file was written'}", file=sys.stderr
+        )
+        return exit_code(stop)
     except (ValueError, MissingExtra) as error:
         if options.debug:
             raise
@@ -65,7 +67,15 @@ def _parser() -> argparse.ArgumentParser:
     estimate = commands.add_parser(
         "estimate", parents=[common], help="run the observer over a table of measurements", **layout
     )
+    estimate.add_argument(
+        "table", metavar="TABLE", nargs="?", help="a table in the place of that of CONFIG; - is standard input"
+    )
     estimate.add_argument("--out", metavar="DIR", type=Path, help="folder of the files (default: results/NAME)")
+    estimate.add_argument(
+        "--follow", action="store_true", help="read a growing file or standard input, print a line of JSON per step"
+    )
+    estimate.add_argument("--resume", action="store_true", help="go on where a long run was interrupted or killed")
+    estimate.add_argument("--format", choices=("text", "json"), default="text", help="of the summary")
     estimate.add_argument(
         "--progress",
         choices=("auto", "always", "never"),
@@ -75,7 +85,16 @@ def _parser() -> argparse.ArgumentParser:
     estimate.set_defaults(command=_estimate)
 
     design = commands.add_parser("design", parents=[common], help="print the certificate alone", **layout)
+    design.add_argument("--format", choices=("text", "json"), default="text", help="of the certificate")
     design.set_defaults(command=_design)
+
+    init = commands.add_parser(
+        "init", help="write a configuration and a plant to fill in, for a table", epilog=INIT, formatter_class=form
+    )
+    init.add_argument("table", metavar="LOG", help="a CSV or Parquet file of measurements")
+    init.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of the files (default: here)")
+    init.add_argument("--debug", action="store_true", help="show the full traceback of every error")
+    init.set_defaults(command=_init)
 
     for name, epilog, text, command in (
         ("sweep", SWEEP, "widths over noise bounds, initial boxes and records, in a study that can be resumed", _sweep),
@@ -110,45 +129,19 @@ class _Version(argparse.Action):
 def _estimate(options: argparse.Namespace) -> int:
     for package in ("pandas", "xarray", "netCDF4", "rich"):
         need(package, extra="cli", purpose="the command line")
-    need("matplotlib", extra="plot", purpose="drawing the picture")
     path, config = _configuration(options.config)
-    wanted = config.table
-    if wanted is None:
+    if config.table is None:
         raise UserError(f"{path.name}: table is missing; estimate needs measurements")
-
-    from .logs import read_table
-    from .output import check_writable, write_all, write_csv, write_netcdf
-    from .problem import build_problem, importable, resolve
-    from .progress import DelayedProgress
-    from .report import show, summarise
-    from .run import run
-
-    out = options.out or Path("results") / path.stem
-    names = config.outputs
-    netcdf, csv, picture = (
-        given or path.stem + ending
-        for given, ending in ((names.netcdf, ".nc"), (names.csv, ".csv"), (names.picture, ".png"))
-    )
-    check_writable(out, [netcdf, csv, picture])
     _use_float64()
-    title = config.title or path.stem
-    with importable(path.parent), DelayedProgress(options.progress) as progress:
-        transform = wanted.transform and resolve(wanted.transform, f"{path.name}: table.transform")
-        draw = resolve(names.draw, f"{path.name}: outputs.draw") if names.draw else _draw
-        problem = build_problem(config, path.name)
-        progress.stage("reading the table")
-        table = read_table(path.parent / wanted.file, wanted, transform or None)
-        outcome = run(problem, table, config.estimate.on_conflict, progress)
-        progress.stage("writing the files")
-        dataset = _dataset(outcome, problem, table, title)
-        writers = {
-            netcdf: lambda target: write_netcdf(dataset, target),
-            csv: lambda target: write_csv(dataset, target),
-            picture: lambda target: _call_draw(draw, names.draw, dataset, target),
-        }
-        files = write_all(out, writers)
-    show(summarise(title, problem, table, outcome, dataset, files), sys.stdout)
-    return 0
+    if options.follow:
+        from .follow import follow
+
+        return follow(options, path, config, config.table)
+    if options.table == "-":
+        raise UserError("standard input (-) is read as it comes: add --follow")
+    from .estimate import estimate
+
+    return estimate(options, path, config, config.table)
 
 
 def _design(options: argparse.Namespace) -> int:
@@ -161,12 +154,26 @@ def _design(options: argparse.Namespace) -> int:
     with importable(path.parent):
         problem = build_problem(config, path.name)
         certificate = design(problem).certificate
+    if options.format == "json":
+        from .figures import certificate_figures, line
+
+        figures = {"title": config.title or path.stem, "certificate": certificate_figures(certificate, problem)}
+        print(line(figures, indent=2))
+        return 0
     print(config.title or path.stem)
     for kind, group in (("state", problem.state), ("input", problem.input)):
         for index, (name, unit) in enumerate(zip(group.names, group.units, strict=True)):
             print(f"  {kind} {index + 1} is {name}{f' [{unit}]' if unit else ''}")
     print(certificate)
     return 0
+
+
+def _init(options: argparse.Namespace) -> int:
+    need("pandas", extra="cli", purpose="the command line")
+    need("pydantic", extra="cli", purpose="the command line")
+    from .init import init
+
+    return init(Path(options.table), options.out)
 
 
 def _sweep(options: argparse.Namespace) -> int:
@@ -216,36 +223,3 @@ def _use_float64() -> None:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-
-
-def _dataset(outcome: Any, problem: Problem, table: Any, title: str) -> Any:
-    from ..dataset import to_dataset
-
-    return to_dataset(
-        outcome.estimate,
-        time=table.time,
-        state_names=problem.state.names,
-        state_units=problem.state.units,
-        input_names=problem.input.names,
-        input_units=problem.input.units,
-        output_names=problem.output.names,
-        output_units=problem.output.units,
-        y=table.y,
-        title=title,
-        certificate=outcome.observer.certificate,
-    )
-
-
-def _draw(dataset: Any, path: Path) -> None:
-    from ..plot import save
-
-    save(dataset, path)
-
-
-def _call_draw(draw: Any, reference: str | None, dataset: Any, path: Path) -> None:
-    if reference is None:
-        return draw(dataset, path)
-    try:
-        draw(dataset, path)
-    except Exception as error:
-        raise UserError(f"outputs.draw: {reference} raised {type(error).__name__}: {reason(error)}") from error

@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from .errors import UserError, reason
 from .fields import Bounds, FileName, Number, Part, Reference, SignalName, check_box
+from .fill_in import check_filled_in
 from .logs.config import TablePart
 from .study_config import MonteCarloPart, SweepPart
 
@@ -88,6 +89,7 @@ class OutputsPart(Part):
     netcdf: FileName | None = None
     csv: FileName | None = None
     picture: FileName | None = None
+    report: FileName | None = None
     draw: Reference | None = None
 
 
@@ -124,13 +126,14 @@ def read_config(path: Path) -> Config:
         raise UserError(f"{path.name}: not valid TOML: {reason(error)}") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path.name}: not valid TOML: the file is not UTF-8 text") from error
+    check_filled_in(raw, path)
     try:
         config = Config.model_validate(raw)
     except ValidationError as error:
         raise UserError(f"{path.name}: {_one_line(error)}") from error
-    names = config.outputs.model_dump(include={"netcdf", "csv", "picture"}, exclude_none=True)
+    names = config.outputs.model_dump(include={"netcdf", "csv", "picture", "report"}, exclude_none=True)
     if len(set(names.values())) < len(names):
-        raise UserError(f"{path.name}: outputs: netcdf, csv and picture must be different files")
+        raise UserError(f"{path.name}: outputs: netcdf, csv, picture and report must be different files")
     return config
 
 

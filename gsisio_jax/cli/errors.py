@@ -7,6 +7,10 @@ class UserError(ValueError):
     """Something in the command, the configuration, the table or the folder is wrong; the message is one line."""
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C where there is more to say than that no file was written."""
+
+
 def reason(error: BaseException) -> str:
     """The text of an error on one line, for use inside another message."""
     if isinstance(error, OSError) and error.strerror:

@@ -5,7 +5,12 @@ from __future__ import annotations
 EXAMPLES = """\
 examples:
   gsisio estimate flight                     a built-in example; files go to results/flight
+  gsisio init pump.csv                       a configuration and a plant to fill in, for a log
   gsisio estimate pump.toml --out today      your own system and table
+  gsisio estimate pump.toml friday.csv       the same with another table
+  gsisio estimate pump.toml --resume         go on where a long run was interrupted or killed
+  logger | gsisio estimate pump.toml - --follow
+                                             a line of JSON per row, as it comes
   gsisio design pump.toml                    what the observer promises, without any data
   gsisio sweep paper                         widths over noise bounds and initial boxes
   gsisio monte-carlo paper                   a thousand simulated runs, each box checked against the truth
@@ -32,14 +37,16 @@ The table [table] says how the log is written; docs/logs.md explains every key:
                                      # left out: such rows are errors
   sparse = true                      # most steps have no row, and that is meant
 
-estimate writes three files: a labelled NetCDF, a CSV with the columns
-time,<signal>_lower,<signal>_upper,...,status  and a PNG. status is a sum of
+estimate writes four files: a labelled NetCDF, a CSV with the columns
+time,<signal>_lower,<signal>_upper,...,status  a PNG, and a report: one HTML file. status is a sum of
 1 conflict (a certified alarm), 2 missing data, 4 unbounded, 8 outside the region, 16 crossed,
 32 ambiguous (several multiples of the period of an angle fit).
 
 exit codes: 0 done, 1 a simulated run was not held by its boxes (monte-carlo), 2 something in the
 command, the configuration, the table or the folder is wrong (one line says what, and no file is
 written), 130 interrupted (143: by SIGTERM).
+
+docs/command-line.md explains init, long tables, --follow, the report and --format json.
 """
 
 _STUDIES = """\
@@ -95,3 +102,12 @@ A box that misses the truth ends the command with exit code 1 and the seed, run 
 gsisio monte-carlo paper --out DIR  runs a small one.
 """
 )
+
+INIT = """\
+Writes NAME.toml and plant.py for a log NAME.csv: what was found in its first rows (separator, clock and
+sample time, columns, what means missing, the resolution of each column as a suggestion for the noise) and
+FILL_IN where only you know. It overwrites nothing. `gsisio estimate NAME.toml` lists what is left to fill in.
+
+  gsisio init pump.csv
+  gsisio init logs/pump.csv --out pump
+"""

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import shutil
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .._extras import need
 from .errors import UserError, reason
+
+CHUNK = 1 << 16  # rows of a chunk of a NetCDF file that is written part by part
+LINES = 1 << 14  # of a CSV file that are text in memory
 
 
 def check_writable(out: Path, names: list[str]) -> None:
@@ -38,12 +43,13 @@ def check_writable(out: Path, names: list[str]) -> None:
             raise UserError(f"cannot write {out / name}: it is a folder")
 
 
-def write_all(out: Path, writers: dict[str, Callable[[Path], None]]) -> list[Path]:
+def write_all(out: Path, writers: dict[str, Callable[[Path], None]], staging_in: Path | None = None) -> list[Path]:
     """Write every file under a temporary name, then rename all of them into place.
 
     Args:
         out: the folder; made where it is not there, and removed again if the writing fails.
         writers: for every file name a function that writes the file whose path it is given.
+        staging_in: folder on the same disk for what is not finished; `out` where left out.
 
     Returns:
         The paths written, in order.
@@ -53,7 +59,7 @@ def write_all(out: Path, writers: dict[str, Callable[[Path], None]]) -> list[Pat
     """
     made = _make_folder(out)
     try:
-        staging = Path(tempfile.mkdtemp(prefix=".gsisio-", dir=out))
+        staging = Path(tempfile.mkdtemp(prefix=".gsisio-", dir=staging_in or out))
         try:
             for name, write in writers.items():
                 try:
@@ -77,27 +83,49 @@ def write_all(out: Path, writers: dict[str, Callable[[Path], None]]) -> list[Pat
     return [out / name for name in writers]
 
 
-def write_netcdf(dataset: Any, path: Path) -> None:
-    """Write a Dataset as NetCDF 4."""
-    dataset.to_netcdf(path, engine="netcdf4")
+def write_netcdf(datasets: Iterable[Any], path: Path) -> None:
+    """Write NetCDF 4: one Dataset as it is, several behind each other along an unlimited time."""
+    netcdf4 = need("netCDF4", extra="cli", purpose="the command line")
+    several = iter(datasets)
+    first, second = next(several), next(several, None)
+    if second is None:
+        first.to_netcdf(path, engine="netcdf4")
+        return
+    chunks = {name: {"chunksizes": (CHUNK,)} for name in first.variables}
+    first.to_netcdf(path, engine="netcdf4", unlimited_dims=["time"], encoding=chunks)
+    with netcdf4.Dataset(path, "a") as file:
+        for variable in file.variables.values():
+            # By default up to 64 MiB of each variable stay in memory.
+            variable.set_var_chunk_cache(size=2 * 8 * CHUNK)
+        for dataset in itertools.chain([second], several):
+            begin = len(file.dimensions["time"])
+            rows = slice(begin, begin + dataset.sizes["time"])
+            for name, variable in dataset.variables.items():
+                file.variables[name][rows] = variable.values
 
 
-def write_csv(dataset: Any, path: Path) -> None:
+def write_csv(datasets: Iterable[Any], path: Path) -> None:
     """Write the boxes as CSV: ``time,<signal>_lower,<signal>_upper,...,status``; numbers read back exactly.
 
     A box that does not exist (the input at the last step) is two empty cells, an unbounded side ``inf`` or ``-inf``.
     """
-    columns = {"time": dataset["time"].values}
-    bounds = [name for name, variable in dataset.data_vars.items() if "signal" in variable.attrs]
-    columns |= {name: dataset[name].values for name in [*bounds, "status"]}
     with open(path, "w", encoding="utf-8", newline="") as stream:
-        stream.write(",".join(columns) + "\n")
-        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-            stream.write(",".join(map(_cell, row)) + "\n")
+        for dataset in datasets:
+            bounds = [name for name, variable in dataset.data_vars.items() if "signal" in variable.attrs]
+            names = ["time", *bounds, "status"]
+            if stream.tell() == 0:
+                stream.write(",".join(names) + "\n")
+            for begin in range(0, dataset.sizes["time"], LINES):
+                columns = [_cells(dataset[name].values[begin : begin + LINES]) for name in names]
+                stream.writelines(f"{line}\n" for line in map(",".join, zip(*columns, strict=True)))
 
 
-def _cell(value: float | int) -> str:
-    return "" if isinstance(value, float) and np.isnan(value) else repr(value)
+def _cells(values: np.ndarray) -> list[str]:
+    """Numbers as they read back exactly; nothing where there is none."""
+    cells = list(map(repr, values.tolist()))
+    for index in np.flatnonzero(np.isnan(values)):
+        cells[index] = ""
+    return cells
 
 
 def _make_folder(out: Path) -> list[Path]:

@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ class Names:
 
 @dataclass(frozen=True)
 class Problem:
-    """All that the observer needs, apart from the measurements."""
+    """All that the observer needs, apart from the measurements; `arguments` are those that the system was made with."""
 
     system: Any
     noise: Any
@@ -39,6 +39,7 @@ class Problem:
     input: Names
     output: Names
     known_input: Names
+    arguments: dict[str, Any] = field(default_factory=dict)
 
 
 @contextlib.contextmanager
@@ -134,6 +135,7 @@ def build_problem(config: Config, file: str) -> Problem:
         u_region=None if config.u_region is None else box("u_region", config.u_region, "known inputs"),
         initial=box("initial", config.initial, "states"),
         design=config.design.model_dump(exclude_none=True),
+        arguments=config.system.arguments,
         **groups,
     )
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from ..observer.status import Status
-from .logs import Table
 from .problem import Problem
 from .run import Outcome
+from .totals import Signal, Totals
 
 SHOWN_TIMES = 8
 SHOWN_ALARMS = 20
 
 Row = tuple[str, ...]
+Notes = Iterable[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -35,35 +34,31 @@ class Summary:
 
 
 def summarise(
-    title: str, problem: Problem, table: Table, outcome: Outcome, dataset: Any, files: Sequence[Path]
+    title: str, problem: Problem, totals: Totals, outcome: Outcome, notes: Notes, files: Iterable[Path]
 ) -> Summary:
-    """Collect the numbers of a finished run."""
-    status = np.asarray(outcome.estimate.status)
-    steps = len(status)
-    conflicts = np.flatnonzero(status & int(Status.CONFLICT))
-    absent = np.isnan(table.y)
-    whole, partly = int(absent.all(axis=1).sum()), int((absent.any(axis=1) & ~absent.all(axis=1)).sum())
-    unbounded = int(np.count_nonzero(status & int(Status.UNBOUNDED)))
+    """Collect the numbers of a finished run; `notes` are those of the table."""
+    partly = f", and {totals.partly} with some entries missing" if totals.partly else ""
+    estimated = totals.steps - outcome.resumed
     facts = [
-        ("steps", f"{steps}, from {seconds(table.time[0])} s to {seconds(table.time[-1])} s"),
-        *table.notes,
-        ("missing rows", f"{whole}" + (f", and {partly} with some entries missing" if partly else "")),
-        ("conflicts", _conflicts(table.time[conflicts])),
-        ("unbounded", f"{unbounded} steps with a state that is not bounded"),
+        ("steps", f"{totals.steps}, from {seconds(totals.first)} s to {seconds(totals.last)} s"),
+        *notes,
+        ("missing rows", f"{totals.absent}{partly}"),
+        ("conflicts", _conflicts(totals.alarm_times)),
+        ("unbounded", f"{totals.statuses['UNBOUNDED']} steps with a state that is not bounded"),
+        *([("resumed", f"after step {outcome.resumed:,}")] if outcome.resumed else []),
         ("design", f"{outcome.design_seconds:.2f} s"),
         ("compile", f"{outcome.compile_seconds:.2f} s"),
-        ("run", f"{outcome.run_seconds:.3g} s, {steps / max(outcome.run_seconds, 1e-9):,.0f} steps/s"),
+        ("run", f"{outcome.run_seconds:.3g} s, {estimated / max(outcome.run_seconds, 1e-9):,.0f} steps/s"),
     ]
     certificate = outcome.observer.certificate
-    records = json.loads(dataset.attrs["alarms"])
-    alarms = [alarm_line(record) for record in records[:SHOWN_ALARMS]]
-    if len(records) > SHOWN_ALARMS:
-        alarms.append(f"... and {len(records) - SHOWN_ALARMS} more, all in the attribute `alarms` of the NetCDF file")
+    alarms = [alarm_line(record) for record in totals.alarms[:SHOWN_ALARMS]]
+    if totals.alarm_count > SHOWN_ALARMS:
+        alarms.append(f"... and {totals.alarm_count - SHOWN_ALARMS} more; every step with status 1 in the files is one")
     return Summary(
         title=title,
         facts=facts,
         header=("signal", "mean width", "last width", "unbounded steps", "certified width", "room in region"),
-        signals=_signals(problem, certificate, dataset),
+        signals=_signals(totals, certificate),
         alarms=alarms,
         certificate=certificate_lines(certificate, problem),
         files=[str(path) for path in files],
@@ -98,29 +93,28 @@ def _conflicts(times: np.ndarray) -> str:
     return f"{len(times)}, at {shown}{', ...' if len(times) > SHOWN_TIMES else ''} s"
 
 
-def _signals(problem: Problem, certificate: Any, dataset: Any) -> list[Row]:
+def _signals(totals: Totals, certificate: Any) -> list[Row]:
     rows = []
-    groups = (
-        (problem.state, np.asarray(certificate.steady_width), np.asarray(certificate.slack)),
-        (problem.input, np.asarray(certificate.input_width), None),
-    )
-    for group, steady, slack in groups:
-        for index, (name, unit) in enumerate(zip(group.names, group.units, strict=True)):
-            width = dataset[f"{name}_upper"].values - dataset[f"{name}_lower"].values
-            width = width[~np.isnan(width)]
-            finite = width[np.isfinite(width)]
-            promised = short(steady[index]) if certificate.certified else "none"
-            rows.append(
-                (
-                    f"{name} [{unit}]" if unit else name,
-                    short(finite.mean()) if len(finite) else "unbounded",
-                    "" if len(width) == 0 else "unbounded" if np.isinf(width[-1]) else short(width[-1]),
-                    str(len(width) - len(finite)),
-                    promised,
-                    short(slack[index]) if slack is not None and certificate.certified else "",
-                )
+    for signal, promise, room in promised(totals, certificate):
+        rows.append(
+            (
+                f"{signal.name} [{signal.unit}]" if signal.unit else signal.name,
+                "unbounded" if signal.mean is None else short(signal.mean),
+                "" if signal.steps == 0 else "unbounded" if signal.last is None else short(signal.last),
+                str(signal.unbounded),
+                "none" if promise is None else short(promise),
+                "" if room is None else short(room),
             )
+        )
     return rows
+
+
+def promised(totals: Totals, certificate: Any) -> Iterator[tuple[Signal, float | None, float | None]]:
+    """Every signal with its certified width and its room in the region; None where nothing is promised."""
+    states = zip(np.asarray(certificate.steady_width), np.asarray(certificate.slack), strict=True)
+    inputs = ((width, None) for width in np.asarray(certificate.input_width))
+    for signal, (width, room) in zip(totals.signals, (*states, *inputs), strict=True):
+        yield (signal, float(width), room) if certificate.certified else (signal, None, None)
 
 
 def seconds(time: float) -> str:

@@ -1,8 +1,9 @@
-"""Design and run the observer over a table, in chunks of constant length so that progress can be shown."""
+"""Design and run the observer over blocks of rows, in chunks of constant length so that memory and programs are few."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,8 @@ import jax
 import numpy as np
 
 from ..observer.estimation import OnConflict
+from .boxes import Boxes, record_type
+from .checkpoint import Checkpoint, Digest, identity, refused
 from .logs import Table
 from .problem import Problem
 from .progress import DelayedProgress
@@ -19,13 +22,14 @@ CHUNK = 1024
 
 @dataclass(frozen=True)
 class Outcome:
-    """The estimate and what it took, in seconds."""
+    """The boxes and what they took, in seconds; `resumed` steps were there from an interrupted run."""
 
     observer: Any
-    estimate: Any
+    boxes: Boxes
     design_seconds: float
     compile_seconds: float
     run_seconds: float
+    resumed: int = 0
 
 
 def design(problem: Problem) -> Any:
@@ -39,55 +43,183 @@ def design(problem: Problem) -> Any:
 
 
 def run(
-    problem: Problem, table: Table, on_conflict: OnConflict, progress: DelayedProgress, chunk: int = CHUNK
+    problem: Problem,
+    blocks: Iterable[Table],
+    on_conflict: OnConflict,
+    progress: DelayedProgress,
+    chunk: int = CHUNK,
+    checkpoint: Checkpoint | None = None,
+    resume: bool = False,
+    total: int | None = None,
 ) -> Outcome:
-    """Design the observer and estimate every step of the table.
+    """Design the observer and estimate every step of a table.
 
     The numbers are those of `gsisio_jax.estimate` on the whole table. Every chunk has the same length, so there is one
-    compilation: the last one is filled up with missing rows whose results are dropped.
-    """
-    import gsisio_jax as gx
+    compilation: one that is not full is filled up with missing rows whose results are dropped.
 
+    Args:
+        problem: what is observed.
+        blocks: the table, some rows at a time, at least one row in all.
+        on_conflict: as in `gsisio_jax.estimate`.
+        progress: told of every chunk.
+        chunk: rows of a chunk.
+        checkpoint: where the rows of a long run are kept; without it they stay in memory.
+        resume: go on from the checkpoint, if there is one.
+        total: number of steps for the progress bar, where it is known.
+
+    Raises:
+        UserError: the checkpoint is that of another run, or whatever reading the blocks raises.
+    """
     clock = time.perf_counter
     progress.stage("designing")
     began = clock()
     observer = design(problem)
     design_seconds = clock() - began
-
-    steps = len(table.time)
+    system = problem.system
+    boxes = Boxes(record_type(system.n, system.p, system.l), checkpoint and checkpoint.begin)
+    runner = _Runner(problem, observer, on_conflict, chunk, boxes, checkpoint)
     progress.stage("compiling")
     began = clock()
-    u0 = None if table.u is None else table.u[0]
-    carry, first = gx.start(observer, problem.initial, table.y[0], u0=u0, on_conflict=on_conflict)
-    parts = [jax.device_get(first)]
-    chunk = min(chunk, steps - 1)
-
-    def advance(carry: Any, y: np.ndarray, u: np.ndarray | None) -> tuple[Any, Any]:
-        carry, outs = gx.estimation.resume(observer, carry, y, u=u, on_conflict=on_conflict)
-        return carry, jax.device_get(outs)
-
-    if chunk > 0:
-        # Once without looking at the result, so that compiling is not counted as running.
-        advance(carry, *_rows(table, 1, 1, chunk))
-    compile_seconds = clock() - began
-
-    progress.stage("estimating", total=steps)
-    progress.advance(1)
-    began = clock()
-    for begin in range(1, steps, max(chunk, 1)):
-        end = min(begin + chunk, steps)
-        carry, outs = advance(carry, *_rows(table, begin, end, chunk))
-        parts.append(jax.tree.map(lambda values, rows=end - begin: values[:rows], outs))
-        progress.advance(end - begin)
-    run_seconds = clock() - began
-    return Outcome(observer, gx.estimation.collect(observer, parts), design_seconds, compile_seconds, run_seconds)
+    try:
+        rows = chunks(blocks, chunk)
+        runner.begin(next(rows), resume)
+        progress.stage("estimating", total=total)
+        progress.advance(1)
+        for part in rows:
+            runner.feed(part)
+            progress.advance(len(part.time))
+        runner.end()
+    except BaseException:
+        boxes.close()
+        raise
+    seconds = clock() - began - runner.compile_seconds
+    return Outcome(observer, boxes, design_seconds, runner.compile_seconds, seconds, runner.resumed)
 
 
-def _rows(table: Table, begin: int, end: int, length: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Rows ``begin`` to ``end``, filled up to `length` with missing rows."""
-    spare = length - (end - begin)
-    y = np.pad(table.y[begin:end], ((0, spare), (0, 0)), constant_values=np.nan)
-    if table.u is None:
-        return y, None
+class _Runner:
+    """The carry of a run, and what has been read so far."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        observer: Any,
+        on_conflict: OnConflict,
+        chunk: int,
+        boxes: Boxes,
+        checkpoint: Checkpoint | None,
+    ):
+        self.problem, self.observer, self.chunk = problem, observer, chunk
+        self.on_conflict: OnConflict = on_conflict
+        self.boxes, self.checkpoint, self.digest = boxes, checkpoint, Digest()
+        self.carry: Any = None
+        self.compile_seconds = 0.0
+        self.resumed, self._stored, self._read, self._full = 0, "", 0, False
+        self.identity = identity(observer, problem, on_conflict, chunk) if checkpoint is not None else ""
+
+    def begin(self, row: Table, resume: bool) -> None:
+        """The first row; from a checkpoint, all is taken from there that it has."""
+        import gsisio_jax as gx
+
+        began = time.perf_counter()
+        u0 = None if row.u is None else row.u[0]
+        carry, out = gx.start(self.observer, self.problem.initial, row.y[0], u0=u0, on_conflict=self.on_conflict)
+        self.carry = carry
+        found = self.checkpoint.load(self.identity, carry) if self.checkpoint is not None and resume else None
+        if found is not None and self.checkpoint is not None:
+            self.carry, self.resumed, self._stored = found
+            self.boxes.reopen(self.checkpoint.boxes, self.resumed)
+            self._count(row)
+        else:
+            self._keep(row, jax.tree.map(lambda values: np.asarray(values)[None], out))
+        self.compile_seconds = time.perf_counter() - began
+
+    def feed(self, part: Table) -> None:
+        """The rows of a chunk; those that the checkpoint has are read only to hold them against it."""
+        steps = len(part.time)
+        if self._read < self.resumed:
+            self._count(part)
+            return
+        # All chunks have one length; filling one up with missing rows is harmless because none comes after it.
+        length = self.chunk if self._full else steps
+        if not self._full:
+            # Once without looking at the result, so that compiling is not counted as running.
+            began = time.perf_counter()
+            self._advance(part, length)
+            self.compile_seconds += time.perf_counter() - began
+        self._full = True
+        self.carry, out = self._advance(part, length)
+        self._keep(part, jax.tree.map(lambda values: values[:steps], out))
+
+    def end(self) -> None:
+        """Complain if the table is shorter than the checkpoint. A kill while files are written shall cost nothing."""
+        if self._read < self.resumed:
+            raise refused(self.resumed)
+        if self.checkpoint is not None and self.boxes.on_disk:
+            self._save(self.checkpoint)
+
+    def _advance(self, part: Table, length: int) -> tuple[Any, Any]:
+        import gsisio_jax as gx
+
+        y, u = filled_up(part, length)
+        carry, out = gx.estimation.resume(self.observer, self.carry, y, u=u, on_conflict=self.on_conflict)
+        return carry, jax.device_get(out)
+
+    def _count(self, part: Table) -> None:
+        self.digest.add(part.time, part.y, part.u)
+        self._read += len(part.time)
+        if self._read >= self.resumed and (self._read > self.resumed or str(self.digest) != self._stored):
+            raise refused(self.resumed)
+
+    def _keep(self, part: Table, out: Any) -> None:
+        self.boxes.append(part.time, part.y, out)
+        self._read += len(part.time)
+        if self.checkpoint is not None:
+            self.digest.add(part.time, part.y, part.u)
+            if self.checkpoint.due(self.boxes):
+                self._save(self.checkpoint)
+
+    def _save(self, checkpoint: Checkpoint) -> None:
+        checkpoint.save(self.boxes, self.carry, self.identity, self.digest)
+
+
+def chunks(blocks: Iterable[Table], size: int) -> Iterator[Table]:
+    """The first row, then chunks of `size` rows; only the last may be shorter.
+
+    Args:
+        blocks: rows, any number at a time.
+        size: rows of a chunk.
+    """
+    wanted, waiting = 1, []
+    for block in blocks:
+        waiting.append(block)
+        if sum(len(one.time) for one in waiting) < wanted:
+            continue
+        whole, begin = joined(waiting), 0
+        while len(whole.time) - begin >= wanted:
+            yield cut(whole, begin, begin + wanted)
+            begin, wanted = begin + wanted, size
+        waiting = [cut(whole, begin, len(whole.time))]
+    rest = joined(waiting)
+    if len(rest.time):
+        yield rest
+
+
+def joined(tables: list[Table]) -> Table:
+    """Several tables as one."""
+    if len(tables) == 1:
+        return tables[0]
+    u = None if tables[0].u is None else np.concatenate([one.u for one in tables if one.u is not None])
+    return Table(np.concatenate([one.time for one in tables]), np.concatenate([one.y for one in tables]), u)
+
+
+def cut(table: Table, begin: int, end: int) -> Table:
+    """Rows `begin` to `end`."""
+    return Table(table.time[begin:end], table.y[begin:end], None if table.u is None else table.u[begin:end])
+
+
+def filled_up(table: Table, length: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Measurements and known inputs, filled up to `length` with missing rows."""
+    spare = length - len(table.time)
+    y = np.pad(table.y, ((0, spare), (0, 0)), constant_values=np.nan)
     # Known inputs must be finite also where their results are dropped.
-    return y, np.concatenate([table.u[begin:end], np.repeat(table.u[begin - 1 : begin], spare, axis=0)])
+    return y, None if table.u is None else np.pad(table.u, ((0, spare), (0, 0)), mode="edge")

@@ -14,7 +14,7 @@ from gsisio_jax.plot.study import KINDS, axes_of, fixed, kept_kinds, prepared, t
 
 @dataclass(frozen=True)
 class Series:
-    """One panel: a box over time."""
+    """One panel: a box over time; `widths` says how wide it is where the boxes themselves do not tell."""
 
     name: str
     unit: str
@@ -22,6 +22,7 @@ class Series:
     upper: np.ndarray
     measured: np.ndarray | None
     kind: str = "state"
+    widths: str | None = None
 
 
 @dataclass(frozen=True)
@@ -58,9 +59,8 @@ def _read_dataset(dataset: Any, call: str) -> Record:
         about = variables[name].attrs
         upper = variables[f"{signal}_upper"].values
         kind = "input" if about.get("role") == "unknown input" else "state"
-        series[signal] = Series(
-            signal, about.get("units", ""), variables[name].values, upper, measured.get(signal), kind
-        )
+        unit, lower = about.get("units", ""), variables[name].values
+        series[signal] = Series(signal, unit, lower, upper, measured.get(signal), kind, about.get("widths"))
     if not series:
         raise ValueError(
             f"{call}: the dataset has no boxes over time: no variable `<signal>_lower` made by `to_dataset`, no "

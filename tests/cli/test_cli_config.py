@@ -48,7 +48,7 @@ CASES = {
     "u not there": ('y = ["pos"', 'u = ["pos"]\ny = ["pos"', ["table.u has 1 column, the system has no known inputs"]),
     "u region": ("[initial]", "[u_region]\nradius = [1.0]\n[initial]", ["u_region is given", "no known inputs"]),
     "file name": ('"boxes.csv"', '"../boxes.csv"', ["outputs.csv: must be a plain file name"]),
-    "same file": ('"boxes.csv"', '"cart.nc"', ["outputs: netcdf, csv and picture must be different files"]),
+    "same file": ('"boxes.csv"', '"cart.nc"', ["outputs: netcdf, csv, picture and report must be different files"]),
     "syntax": ("[noise]", "[noise", ["cart.toml: not valid TOML", "line 8"]),
     "conflict rule": ("[outputs]", "[estimate]\non_conflict = 'stop'\n[outputs]", ["estimate.on_conflict", "'stop'"]),
     "gains": ("sweeps = 1", "gains = 0", ["design.gains must be greater than or equal to 1"]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -69,6 +70,20 @@ def test_a_dataset_needs_no_arguments(data):
     assert labels == {
         "no measurement", "guaranteed box (full height: not bounded)", "measured", "certified alarm",
     }  # fmt: skip
+
+
+def test_many_alarms_are_one_object_with_one_label(data):
+    times = [0.25 * step for step in range(60)]
+    data.attrs["alarms"] = json.dumps([{"time": time} for time in times])
+    axis = plot.framers(data, ["leak"])[0]
+    (lines,) = (one for one in axis.collections if one.get_label() == "certified alarm")
+    assert [segment[0][0] for segment in lines.get_segments()] == times
+    assert [text.get_text() for text in axis.figure.legends[0].get_texts()].count("certified alarm") == 1
+
+
+def test_widths_in_words_of_the_dataset(data):
+    data["leak_lower"].attrs["widths"] = "width: mean 4, last 4"
+    assert plot.framers(data, ["leak"])[0].get_title(loc="right") == "width: mean 4, last 4"
 
 
 def test_measurements_find_their_signal_by_name_and_unit(est):

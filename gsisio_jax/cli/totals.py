@@ -1,0 +1,124 @@
+"""What a summary counts, gathered part by part."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ..dataset import alarm_records
+from ..observer.alarms import read_alarms
+from ..observer.status import Status
+from .problem import Names, Problem
+
+MOST_ALARMS = 10_000  # with their words; status and margin of the files have all
+
+
+@dataclass
+class Signal:
+    """Widths of one state or input; `mean` is over the bounded steps, None where there is none."""
+
+    name: str
+    unit: str
+    kind: str
+    total: float = 0.0
+    bounded: int = 0
+    unbounded: int = 0
+    last: float | None = None
+
+    @property
+    def steps(self) -> int:
+        return self.bounded + self.unbounded
+
+    @property
+    def mean(self) -> float | None:
+        return self.total / self.bounded if self.bounded else None
+
+    def add(self, width: np.ndarray) -> None:
+        width = width[~np.isnan(width)]
+        finite = width[np.isfinite(width)]
+        self.total += float(finite.sum())
+        self.bounded += len(finite)
+        self.unbounded += len(width) - len(finite)
+        if len(width):
+            self.last = float(width[-1]) if np.isfinite(width[-1]) else None
+
+
+@dataclass
+class Totals:
+    """Counts over all steps of a run.
+
+    Attributes:
+        absent, partly: rows without any measurement, and with some entries missing.
+        statuses: steps by the bit of their status.
+        alarms: the first `MOST_ALARMS` as plain data; `alarm_times` has the times of all, `alarm_count` of them.
+    """
+
+    signals: list[Signal]
+    steps: int = 0
+    first: float = np.nan
+    last: float = np.nan
+    absent: int = 0
+    partly: int = 0
+    statuses: dict[str, int] = field(default_factory=dict)
+    alarms: list[dict[str, Any]] = field(default_factory=list)
+    alarm_times: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def alarm_count(self) -> int:
+        return len(self.alarm_times)
+
+
+def gather(parts: Iterable[np.ndarray], problem: Problem, output_rows: Sequence[tuple[int, ...]]) -> Totals:
+    """Count over the parts of `Boxes`.
+
+    Args:
+        parts: rows in order.
+        problem: names and units.
+        output_rows: of the observer, which outputs a row of T2 combines.
+    """
+    totals = Totals([*_signals(problem.state, "state"), *_signals(problem.input, "input")])
+    members = [member for member in Status if member.value]
+    totals.statuses = {str(member.name): 0 for member in members}
+    times = []
+    for rows in parts:
+        if totals.steps == 0:
+            totals.first = float(rows["time"][0])
+        totals.last = float(rows["time"][-1])
+        missing = np.isnan(rows["y"])
+        whole = missing.all(axis=1)
+        totals.absent += int(whole.sum())
+        totals.partly += int((missing.any(axis=1) & ~whole).sum())
+        for member in members:
+            totals.statuses[str(member.name)] += int(np.count_nonzero(rows["status"] & int(member)))
+        width = np.concatenate([rows[f"{kind}_upper"] - rows[f"{kind}_lower"] for kind in ("state", "input")], axis=1)
+        for index, signal in enumerate(totals.signals):
+            signal.add(width[:, index])
+        times.append(rows["time"][(rows["status"] & int(Status.CONFLICT)) != 0])
+        totals.alarms += alarms_of(rows, problem, output_rows, totals.steps, MOST_ALARMS - len(totals.alarms))
+        totals.steps += len(rows)
+    totals.alarm_times = np.concatenate(times)
+    return totals
+
+
+def alarms_of(
+    rows: np.ndarray, problem: Problem, output_rows: Sequence[tuple[int, ...]], begin: int, most: int | None = None
+) -> list[dict[str, Any]]:
+    """The alarms of some rows as plain data; `begin` is the step of the first row, `most` their largest number."""
+    conflicts = np.flatnonzero(rows["status"] & int(Status.CONFLICT))[:most]
+    some = rows[conflicts]
+    found = SimpleNamespace(alarms=lambda: read_alarms(some["status"], some["margin"], some["source"], output_rows))
+    labels = {
+        f"{group}_{what}": getattr(getattr(problem, group), what)
+        for group in ("state", "input", "output")
+        for what in ("names", "units")
+    }
+    records = alarm_records(found, some["time"], **labels)
+    return [record | {"step": int(begin + place)} for record, place in zip(records, conflicts, strict=True)]
+
+
+def _signals(group: Names, kind: str) -> list[Signal]:
+    return [Signal(name, unit, kind) for name, unit in zip(group.names, group.units, strict=True)]
