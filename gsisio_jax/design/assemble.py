@@ -134,9 +134,10 @@ def _certificate(
     steady = problem.steady_width(main)
     before = np.abs(J1 @ problem.F + J2 @ problem.E) + np.abs(J1) @ problem.F_radius + np.abs(J2) @ problem.E_radius
     certified = bool(np.isfinite(steady).all())
+    input_fixed = np.abs(inverses.known[0]) @ problem.dd
     input_width = np.full(len(J1), np.inf)
     if certified:
-        input_width = np.abs(J1) @ (steady + problem.dw) + before @ steady + np.abs(J2) @ problem.dv
+        input_width = np.abs(J1) @ (steady + problem.dw) + before @ steady + np.abs(J2) @ problem.dv + input_fixed
     return Certificate(
         region=Interval(np.array(region.lower, np.float64), np.array(region.upper, np.float64)),
         region_matters=bool(np.isfinite(np.concatenate([region.lower, region.upper])).any()),
@@ -148,6 +149,7 @@ def _certificate(
         input_state_now=np.abs(J1),
         input_state_before=before,
         input_noise_v=np.abs(J2),
+        input_fixed=input_fixed,
         steady_width=steady,
         input_width=input_width,
         equality_residual=np.abs(problem.residual(main)[:, problem.free]).max(initial=0.0),

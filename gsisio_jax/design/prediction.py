@@ -165,6 +165,7 @@ def _certificate(
         input_state_now=np.abs(gains.J1),
         input_state_before=before,
         input_noise_v=np.abs(gains.J2),
+        input_fixed=np.zeros(system.p),
         steady_width=steady,
         input_width=input_width,
         equality_residual=np.abs(gains.J @ stacked - np.eye(system.p)).max(initial=0.0),

@@ -47,6 +47,7 @@ class Certificate(eqx.Module):
     input_state_now: Any  # |J1|, (p, n): weight of width[k]
     input_state_before: Any  # (p, n): weight of width[k-1]
     input_noise_v: Any  # |J2|, (p, l)
+    input_fixed: Any  # width that known input bounds contribute, (p,)
     steady_width: Any
     input_width: Any
     equality_residual: Any
@@ -115,7 +116,7 @@ class Certificate(eqx.Module):
     def input_width_after(self, now: Any, before: Any, noise: Noise) -> Any:
         """Width of the box of d[k-1] from the state widths at k and k-1, (p,) or a stack (..., p)."""
         known = noise.w.width @ self.input_state_now.T + noise.v.width @ self.input_noise_v.T
-        return now @ self.input_state_now.T + before @ self.input_state_before.T + known
+        return now @ self.input_state_now.T + before @ self.input_state_before.T + known + self.input_fixed
 
     def __str__(self) -> str:
         lines = [self._headline()]

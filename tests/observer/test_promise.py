@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
@@ -55,6 +56,40 @@ def test_a_gain_of_the_new_measurement_alone_needs_no_past():
     observer = gx.design_observer(system, gx.Noise(ball(0.1, 2), ball(0.2, 3)), Interval.entire(2), missing=False)
     boxes = gx.estimate(observer, Interval.entire(2), np.zeros((2, 3)))
     assert np.isfinite(boxes.state.width).all()
+
+
+@pytest.mark.parametrize("state_bounds", [False, True], ids=["", "state bounds"])
+@pytest.mark.parametrize("inputs", ["free", "one bounded", "bounded"])
+def test_widths_of_states_and_inputs_with_every_combination_of_bounds(state_bounds, inputs):
+    """Linear plants: no box settles wider than promised, whatever is known of states and inputs."""
+    rng = np.random.default_rng(len(inputs))
+    A, C = 0.5 * rng.standard_normal((3, 3)), rng.standard_normal((4, 3))
+    known = {"free": [np.inf] * 2, "one bounded": [0.4, np.inf], "bounded": [0.4, 0.05]}[inputs]
+    system = gx.System(
+        lambda x: A @ x,
+        lambda x: C @ x,
+        G=rng.standard_normal((3, 2)),
+        H=np.diag([0.0, 1.0, 0.0, 0.0])[:, :2],
+        state_bounds=ball(3.0, 3) if state_bounds else None,
+        input_bounds=Interval.symmetric(known),
+    )
+    noise = gx.Noise(ball(0.02, 3), ball(0.3, 4))
+    observer = gx.design_observer(system, noise, ball(3.0, 3), missing=False, sweeps=1)
+    d = rng.uniform(-1, 1, (40, 2)) * np.minimum(known, 0.05)
+    record = gx.simulate(system, jax.random.key(0), np.zeros(3), d, noise)
+    boxes = gx.estimate(observer, ball(3.0, 3), record.y)
+    certificate = observer.certificate
+    assert certificate.certified
+    assert (np.asarray(boxes.state.width)[-10:] <= certificate.steady_width * (1 + 1e-9)).all()
+    assert (np.asarray(boxes.input.width)[-10:] <= certificate.input_width * (1 + 1e-9)).all()
+    assert np.isfinite(certificate.input_width).all()
+
+
+def test_the_input_width_counts_bounds_that_are_known():
+    """Noise so large that the measurements say nothing: what is left of the input is its bound, 0.2 wide."""
+    system = gx.System(lambda x: 0.9 * x, lambda x: x, G=[[1.0]], H=[[0.0]], input_bounds=ball(0.1, 1))
+    observer = gx.design_observer(system, gx.Noise(ball(0.01, 1), ball(1.0, 1)), ball(2.0, 1), missing=False, sweeps=1)
+    np.testing.assert_allclose(observer.certificate.input_width, 0.2)
 
 
 def ball(radius: float, size: int) -> Interval:
