@@ -12,7 +12,14 @@ from gsisio_jax.design.assemble import Plan, assemble
 from gsisio_jax.design.existence import check_existence
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.first_gain import first_gain
-from gsisio_jax.design.gain_selection import distinct, gains_for_missing, profile_bank, typical_width, units
+from gsisio_jax.design.gain_selection import (
+    distinct,
+    gains_for_missing,
+    gains_without_state_bounds,
+    profile_bank,
+    typical_width,
+    units,
+)
 from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.inputs import input_bounds
@@ -137,7 +144,7 @@ def design_observer(
     bank = [main, *profile_bank(problem, main, box, gains - 1)]
     if missing or system.periodic:  # the multiple of a periodic output is chosen without that output
         bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
-    bank = distinct(bank)
+    bank = distinct([*bank, *gains_without_state_bounds(problem, main, box)])
     steady = problem.steady_width(bank[0])
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
     outputs, slack = first_form(system, feedthrough.T2, u_region)

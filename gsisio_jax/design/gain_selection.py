@@ -100,6 +100,25 @@ def gains_for_missing(
     return [gain for gain in found if gain is not None]
 
 
+def gains_without_state_bounds(problem: GainProblem, main: np.ndarray, region: Interval) -> list[np.ndarray]:
+    """Gains that do not use bounds of the states: with y[k] and without it.
+
+    A gain that is best for its own steady width may put a bound in the place of a state that it could have followed:
+    its boxes then widen to that bound, where without it they would have stayed narrow.
+    """
+    if not len(problem.ds):
+        return []
+    steady = problem.steady_width(main)
+    profile = 0.1 * (units(steady) if np.isfinite(steady).all() else typical_width(problem, region))
+    found = []
+    for measured in (True, False):
+        usable = np.full(problem.columns, True)
+        usable[problem.l : problem.l + problem.q] = measured
+        usable[problem.l + problem.q :] = False
+        found.append(profile_gain(problem, profile, usable, units(profile)))
+    return [gain for gain in found if gain is not None]
+
+
 def distinct(bank: list[np.ndarray]) -> list[np.ndarray]:
     """Drop gains that repeat an earlier one; keep the first, certified one in front."""
     kept: list[np.ndarray] = []

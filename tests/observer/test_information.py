@@ -1,0 +1,60 @@
+"""Who knows more gets no wider boxes: true bounds of states and inputs never hurt."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gsisio_jax as gx
+from gsisio_jax import Interval
+
+STEPS = 100
+
+
+def ball(*radii):
+    return Interval.symmetric(radii)
+
+
+def sir(**known):
+    """Susceptible and infected shares; the infected are counted."""
+
+    def f(x):
+        infected = 0.25 * x[0] * x[1]
+        return jnp.stack([x[0] - infected, x[1] + infected - 0.1 * x[1]])
+
+    system = gx.System(f, lambda x: x[1:], G=np.zeros((2, 0)), H=np.zeros((1, 0)), **known)
+    return system, Interval([0.0, 0.0], [1.0, 0.6]), Interval([0.5, 0.0], [1.0, 0.1]), np.array([0.9, 0.05]), 5e-4
+
+
+def cart(**known):
+    """Position and speed under an unknown force; the position is measured, and the speed poorly."""
+    A = np.array([[1.0, 0.1], [0.0, 0.98]])
+    system = gx.System(lambda x: A @ x, lambda x: x, G=[[0.005], [0.1]], H=np.zeros((2, 1)), **known)
+    return system, ball(5.0, 5.0), ball(1.0, 1.0), np.array([0.3, -0.2]), 0.05
+
+
+PLANTS = {
+    "SIR, state bounds": (sir, {"state_bounds": Interval([0.0, 0.0], [1.0, 1.0])}),
+    "cart, state bounds": (cart, {"state_bounds": ball(4.0, 2.0)}),
+    "cart, input bounds": (cart, {"input_bounds": ball(1.0)}),
+    "cart, both": (cart, {"state_bounds": ball(4.0, 2.0), "input_bounds": ball(1.0)}),
+}
+
+
+def widths(make, known, y=None):
+    """Widths (T, n) of the boxes, and the record they are made from."""
+    system, region, initial, x0, v = make(**known)
+    noise = gx.Noise(ball(1e-6, 1e-6), Interval.symmetric([v] * system.l))
+    observer = gx.design_observer(system, noise, region, missing=False, certify=False)
+    if y is None:
+        d = 0.5 * np.sin(0.2 * np.arange(STEPS))[:, None] * np.ones((1, system.p))
+        y = gx.simulate(system, jax.random.key(0), x0, d, noise).y
+    return np.asarray(gx.estimate(observer, initial, y).state.width), y
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_true_bounds_never_widen_a_box(name):
+    make, known = PLANTS[name]
+    without, y = widths(make, {})
+    with_bounds, _ = widths(make, known, y)
+    assert (with_bounds[-20:] <= without[-20:] * (1 + 1e-6)).all()
