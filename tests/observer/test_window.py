@@ -141,9 +141,22 @@ def test_float32():
     np.testing.assert_allclose(boxes.width, run(rotation(4), y).state.width, rtol=2e-3)
 
 
+@pytest.mark.parametrize(("w", "worth"), [(W, True), ([50.0, 50.0], False)])
+def test_auto_takes_a_window_only_where_it_is_worth_it(w, worth):
+    """Where noise moves the state farther than its measurement errs, what was known of it before is worth nothing."""
+    system = gx.System(lambda x: TURN @ x, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)))
+    noise = gx.Noise(Interval.symmetric(w), NOISE.v)
+    observer = gx.design_observer(system, noise, Interval.symmetric([5.0, 5.0]), missing=False, window="auto")
+    assert (observer.window is not None) == worth
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"window": 0}, "at least 1"), ({"window": 2, "form": "prediction"}, "prediction form")],
+    [
+        ({"window": 0}, "at least 1"),
+        ({"window": "long"}, "number of steps"),
+        ({"window": 2, "form": "prediction"}, "prediction form"),
+    ],
 )
 def test_windows_that_cannot_be(options, words):
     system = gx.System(lambda x: TURN @ x, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)))

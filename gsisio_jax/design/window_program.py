@@ -1,0 +1,105 @@
+"""The linear program for one row of a window: which combination of the plant's equations bounds a state best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+from scipy.optimize import linprog
+
+from gsisio_jax.design.problem import GainProblem
+
+_SMALL = 1e-9  # multipliers below this are what a solver leaves, in units of the noise and the boxes
+
+
+@dataclass(frozen=True)
+class WindowProgram:
+    """Everything that a row over m steps is made of, as linear in its unknowns (a of every step, lambda, n_z).
+
+    Attributes:
+        parts: (k, unknowns), with `offset` (k, n) for each state: slopes on the boxes of x, lambda, a, ``n_z T2``, n_z,
+            and what is left of bounded inputs; blocks over N steps, the oldest first.
+        equal: (e, unknowns), with `equal_offset` (e, n): must vanish, so that free inputs cancel.
+        multipliers: places of lambda in `parts`.
+    """
+
+    parts: np.ndarray
+    offset: np.ndarray
+    equal: np.ndarray
+    equal_offset: np.ndarray
+
+    @classmethod
+    def of(cls, problem: GainProblem, steps: int, length: int) -> WindowProgram:
+        """Rows over the last `steps` of `length` steps: nothing is asked of the older ones."""
+        n, l, q = problem.n, problem.l, problem.q
+        F, E, C, G, H = problem.F, problem.E, problem.C[:q], problem.G, problem.H
+        count = steps * l + (steps - 1) * n + q
+        unknown = np.eye(count)
+        a = [unknown[j * l : (j + 1) * l] for j in range(steps)]
+        states = unknown[steps * l : steps * l + (steps - 1) * n].reshape(steps - 1, n, count)
+        n_z = unknown[count - q :]
+        none, whole = np.zeros((n, count)), np.zeros((n, n))
+        # lambda_j for j = 0 (0), ..., steps (e_i - C' n_z).
+        weights = [none, *states, -C.T @ n_z]
+        constant = [whole] * steps + [np.eye(n)]
+        slopes, of_f, of_g, offsets, equal, equal_offset, known, known_offset = [], [], [], [], [], [], [], []
+        for j in range(steps):
+            slopes.append(F.T @ weights[j + 1] - weights[j] - E.T @ a[j])
+            offsets.append(F.T @ constant[j + 1] - constant[j])
+            of_f.append(weights[j + 1])
+            of_g.append(a[j])
+            through, through_offset = G.T @ weights[j + 1] - H.T @ a[j], G.T @ constant[j + 1]
+            equal.append(through[problem.free])
+            equal_offset.append(through_offset[problem.free])
+            known.append(through[~problem.free])
+            known_offset.append(through_offset[~problem.free])
+        older = length - steps
+
+        def blocks(found: list[np.ndarray], rows: int, columns: int) -> list[np.ndarray]:
+            return [np.zeros((rows, columns))] * older + found
+
+        b = int((~problem.free).sum())
+        parts = [
+            *blocks(slopes, n, count), *blocks(of_f, n, count), *blocks(of_g, l, count),
+            problem.T2.T @ n_z, n_z, *blocks(known, b, count),
+        ]  # fmt: skip
+        offset = [
+            *blocks(offsets, n, n), *blocks(constant[1:], n, n), *[np.zeros((l, n))] * length,
+            np.zeros((l, n)), np.zeros((q, n)), *blocks(known_offset, b, n),
+        ]  # fmt: skip
+        return cls(np.vstack(parts), np.vstack(offset), np.vstack(equal), np.vstack(equal_offset))
+
+    def best(self, state: int, size: np.ndarray, drift: np.ndarray) -> tuple[np.ndarray, float] | None:
+        """The parts of the row with the least ``size |parts| + drift parts``, and that; None where there is none."""
+        k, count = self.parts.shape
+        split = [sparse.csr_array(self.parts), -sparse.eye_array(k), sparse.eye_array(k)]
+        rows = sparse.hstack(split)
+        if len(self.equal):
+            rows = sparse.vstack([rows, sparse.hstack([self.equal, sparse.csr_array((len(self.equal), 2 * k))])])
+        found = linprog(
+            np.concatenate([np.zeros(count), size + drift, size - drift]),
+            A_eq=sparse.csc_array(rows),
+            b_eq=-np.concatenate([self.offset[:, state], self.equal_offset[:, state]]),
+            bounds=[(None, None)] * count + [(0, None)] * (2 * k),
+            method="highs-ds",
+        )
+        if found.status != 0:
+            return None
+        x = self._exactly_free(found.x[:count], state)
+        if x is None:
+            return None
+        parts = self.parts @ x + self.offset[:, state]
+        parts[np.abs(parts) < _SMALL] = 0
+        return parts, found.fun
+
+    def _exactly_free(self, x: np.ndarray, state: int) -> np.ndarray | None:
+        """Small multipliers are 0, and the others moved so that free inputs cancel to rounding."""
+        used = np.abs(x) > _SMALL
+        x = np.where(used, x, 0.0)
+        if len(self.equal):
+            missing = -self.equal_offset[:, state] - self.equal @ x
+            x[used] += np.linalg.lstsq(self.equal[:, used], missing, rcond=None)[0]
+            if np.abs(self.equal @ x + self.equal_offset[:, state]).max() > _SMALL:
+                return None
+        return x

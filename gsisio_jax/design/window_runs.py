@@ -1,0 +1,99 @@
+"""Rows of windows, and simulated runs of an observer that has them.
+
+A run is simulated in errors: how far the sides of a box are from the true state depends on the noise and on the boxes
+before, and on nothing else where f and g are affine. Where they are not, the spread of their slopes counts as noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsisio_jax.design.problem import GainProblem
+
+FAR = 1e6  # steady widths beyond this many units are not waited for
+RUNS, _STEPS = 12, 20
+
+
+@dataclass
+class Rows:
+    """Rows found so far: parts (R, k) over `length` steps, and the state of each."""
+
+    parts: list[np.ndarray]
+    states: list[int]
+
+    def add(self, state: int, parts: np.ndarray) -> None:
+        """Unless it is there."""
+        same = (
+            np.allclose(parts, old, atol=1e-7) for old, of in zip(self.parts, self.states, strict=True) if of == state
+        )
+        if not any(same):
+            self.parts.append(parts)
+            self.states.append(state)
+
+    def kept(self, places: list[int]) -> Rows:
+        """Only those."""
+        return Rows([self.parts[r] for r in places], [self.states[r] for r in places])
+
+    def of(self, state: int) -> np.ndarray:
+        return np.flatnonzero(np.array(self.states) == state)
+
+
+class Runs:
+    """Simulated runs of the observer in errors, `RUNS` side by side: distances (S, n) of both sides from the state."""
+
+    def __init__(self, problem: GainProblem, length: int, start: np.ndarray, rng: np.random.Generator):
+        self.problem, self.length, self.start, self.rng = problem, length, start, rng
+
+    def of(self, rows: Rows, vertices: bool) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """For every step with a whole window: sizes and drifts (S, k) of the parts of a row, and the distances to the
+        lower and the upper side (S, n)."""
+        P, N, n = self.problem, self.length, self.problem.n
+        total = N + _STEPS
+        w, v = self._noise(P.dw / 2, total, vertices), self._noise(P.dv / 2, total, vertices)
+        below, above = [np.tile(self.start, (RUNS, 1))], [np.tile(self.start, (RUNS, 1))]
+        parts = np.array(rows.parts)
+        belongs = np.array(rows.states)
+        found = []
+        for k in range(1, total):
+            size, drift = self._terms(below, above, w, v, k)
+            spread, moved = size @ np.abs(parts).T, drift @ parts.T
+            sides = []
+            for sign in (-1, 1):
+                reach = spread + sign * moved
+                best = [reach[:, belongs == i].min(1, initial=np.inf) for i in range(n)]
+                sides.append(np.minimum(np.stack(best, 1), FAR * self.start))
+            below.append(sides[0])
+            above.append(sides[1])
+            if k > N + 3:
+                found.append((size, drift, *sides))
+        return found
+
+    def _noise(self, radius: np.ndarray, steps: int, vertices: bool) -> np.ndarray:
+        shape = (RUNS, steps, len(radius))
+        unit = self.rng.choice([-1.0, 1.0], shape) if vertices else self.rng.uniform(-1, 1, shape)
+        return radius * unit
+
+    def _terms(self, below: list, above: list, w: np.ndarray, v: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        P, N, n = self.problem, self.length, self.problem.n
+        unknown = np.zeros((RUNS, n)), np.tile(FAR * self.start, (RUNS, 1))
+        boxes = [
+            (0.5 * (above[j] - below[j]), 0.5 * (above[j] + below[j])) if j >= 0 else unknown for j in range(k - N, k)
+        ]
+        off, half = [box[0] for box in boxes], [box[1] for box in boxes]
+        none_w, none_v = np.zeros((RUNS, n)), np.zeros((RUNS, P.l))
+        of_f = [P.dw / 2 + h @ P.F_radius.T for h in half]
+        of_g = [P.dv / 2 + h @ P.E_radius.T for h in half]
+        of_z = half[-1] @ P.R.T
+        known = np.tile(P.dd / 2, (RUNS, N))
+        size = [*half, *of_f, *of_g, np.tile(P.dv / 2, (RUNS, 1)), of_z, known]
+        drift = [
+            *off,
+            *(-w[:, j] if j >= 0 else none_w for j in range(k - N, k)),
+            *(v[:, j] if j >= 0 else none_v for j in range(k - N, k)),
+            v[:, k],
+            np.zeros_like(of_z),
+            np.zeros_like(known),
+        ]
+        return np.concatenate(size, 1), np.concatenate(drift, 1)
