@@ -1,6 +1,6 @@
 """Studies: many runs of an observer over named axes, reduced as they go along.
 
-`sweep` runs records at hand, `monte_carlo` simulates its own.
+`sweep` runs records at hand, `monte_carlo` simulates its own; `tightness` says how near to the exact hull boxes are.
 """
 
 from gsisio_jax.study.axes import Axis, Layout, Truth, grid
@@ -10,6 +10,7 @@ from gsisio_jax.study.reduction_base import Context, Kept, Reduction, Variable
 from gsisio_jax.study.reductions import REDUCTIONS, quantiles, settle
 from gsisio_jax.study.summary import STATISTICS, summary
 from gsisio_jax.study.sweep import sweep
+from gsisio_jax.study.tightness import Tightness, tightness
 
 __all__ = [
     "BROKEN",
@@ -20,6 +21,7 @@ __all__ = [
     "Kept",
     "Layout",
     "Reduction",
+    "Tightness",
     "Truth",
     "Variable",
     "grid",
@@ -28,4 +30,5 @@ __all__ = [
     "settle",
     "summary",
     "sweep",
+    "tightness",
 ]
