@@ -13,8 +13,8 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-# The smallest that HiGHS takes; then without its simplifications, which may leave open whether a program that has no
-# solution is empty or unbounded; then what it takes by itself.
+# The smallest that HiGHS takes; then without its simplifications, which call unbounded programs infeasible; then what it
+# takes by itself.
 _TIGHT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 _ATTEMPTS: tuple[dict[str, Any], ...] = (_TIGHT, _TIGHT | {"presolve": False}, {"presolve": False})
 
@@ -131,7 +131,7 @@ class RecordProgram:
             if found.status == 0:
                 x, d = np.split(found.x[:-1], [s * n])
                 return Extreme(sign * found.fun, x.reshape(s, n), d.reshape(s, p))
-            if found.status in (2, 3):
+            if found.status in (2, 3) and "presolve" in options:
                 return Extreme(np.nan if found.status == 2 else -sign * np.inf)
         raise RuntimeError(f"tightness: HiGHS could not solve a program of {s} rows: {found.message}")
 

@@ -180,7 +180,7 @@ def _chosen(steps: Sequence[int] | None, rows: int) -> np.ndarray:
     if rows == 0:
         raise ValueError("tightness: the record has no rows")
     if steps is None:
-        return np.unique(np.linspace(0, rows - 1, min(STEPS, rows) + 1).round().astype(int)[1:])
+        return np.arange(rows) if rows <= STEPS else np.linspace(0, rows - 1, STEPS + 1).round().astype(int)[1:]
     found = np.asarray(steps)
     if found.ndim != 1 or not found.size or found.dtype.kind not in "iu":
         raise ValueError(f"tightness: `steps` must be a list of integers, got {steps!r}")
