@@ -6,6 +6,7 @@ with every measurement. Nothing is proved about what was not found, so the hull 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -16,9 +17,11 @@ from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.study.record_program import Affine, RecordProgram, Sides, Stretch
 
 # How far to go from a run in the middle towards the one that a program proposes.
-SHARES = np.array([1, 1 - 1e-7, 0.9999, 0.999, 0.99, 0.97, 0.93, 0.85, 0.7, 0.5, 0.25])
-ROUNDS = 6  # of programs along the best runs so far
-ENOUGH = 1e-3  # stop where a round widens no side by more than this share of the width
+SHARES = 1 - np.array([0, 1e-7, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9, 0.98, 0.998])
+ROUNDS = 20  # of programs along the best runs so far, at most
+ENOUGH = 1e-3  # of the width: a side that moved by less was idle
+PATIENCE = 3  # idle rounds, each with a smaller step, that end the search for a side
+SHRINK = 0.1  # of the last step, after an idle round
 FIRST = 10  # programs to find a first run
 TOLERANCE = 1e-12  # of the size of a measurement: what rounding may leave of it
 
@@ -32,9 +35,7 @@ class Maps:
 
         self.rows, self.many = rows, many
         with jax.enable_x64(True):
-            along, across = (
-                (np.zeros((count, system.n)), np.zeros((count, system.m))) for count in (rows, many)
-            )
+            along, across = ((np.zeros((count, system.n)), np.zeros((count, system.m))) for count in (rows, many))
             self._slopes = numpy_function(jax.vmap(jax.jacfwd(both)), *along)
             self._along = numpy_function(jax.vmap(both), *along)
             self._across = numpy_function(jax.vmap(both), *across)
@@ -68,38 +69,48 @@ class AgreeingRuns:
             stretch: the record; its state bounds are those of the plant.
             near: boxes (s, n) to look for runs in.
         """
-        # The boxes guide the programs; a run that leaves them counts, too.
-        inside = Stretch(**{**vars(stretch), "state": near})
+        # The boxes guide the programs; a run that leaves them counts, too. The last state is left free: a program that
+        # is extreme at a side of its box would leave open which way leads there.
+        guide = Sides(*(np.concatenate([a[:-1], b[-1:]]) for a, b in zip(near, stretch.state, strict=True)))
+        inside = replace(stretch, state=guide)
         first = self._first(inside, stretch)
         n = self.n
         if first is None:
             return Sides(np.full(n, np.nan), np.full(n, np.nan))
-        middle_x, middle_d = first
-        best = np.tile(middle_x, (2 * n, 1, 1))
+        x0, d0 = first
+        sides = range(2 * n)
         signs, states = np.repeat([1, -1], n), np.tile(np.arange(n), 2)
-        reached = signs * best[np.arange(2 * n), -1, states]
-        for turn in range(ROUNDS):
-            same = RecordProgram(inside, self.maps.affine(middle_x, inside.u)) if turn == 0 else None
-            proposed = [self._proposed(inside, same, best[j], states[j], signs[j]) for j in range(2 * n)]
-            x, d = (np.array([run[i] if run else (middle_x, middle_d)[i] for run in proposed]) for i in (0, 1))
-            mix = SHARES[:, None, None, None]
-            x, agrees = self._played(
-                stretch, *((m + mix * (v - m)).reshape(self.maps.many, *m.shape) for m, v in ((middle_x, x), (middle_d, d)))
-            )
-            before = reached.copy()
-            for j in range(2 * n):
-                ends = np.where(agrees, signs[j] * x[:, -1, states[j]], np.inf)
-                if ends.min() < reached[j]:
-                    best[j], reached[j] = x[ends.argmin()], ends.min()
+        best = np.tile(x0, (2 * n, 1, 1))
+        reached = signs * x0[-1, states]
+        reach, idle = np.full((2 * n, n), np.inf), np.zeros(2 * n, int)  # of a step, per state; rounds
+        for _ in range(ROUNDS):
+            proposed = best.copy()
+            inputs = np.tile(d0, (2 * n, 1, 1))
+            for j in (j for j in sides if idle[j] < PATIENCE):
+                found = self._program(inside, best[j], reach[j]).extreme(states[j], signs[j])
+                if found.x is not None and found.d is not None:
+                    proposed[j], inputs[j] = found.x, found.d
+            share = SHARES[:, None, None, None]
+            mixed = (m + share * (v - m) for m, v in ((x0, proposed), (d0, inputs)))
+            x, agrees = self._played(stretch, *(v.reshape(self.maps.many, *v.shape[2:]) for v in mixed))
+            x, agrees = x.reshape(len(SHARES), *best.shape), agrees.reshape(len(SHARES), -1)
             width = -(reached[:n] + reached[n:])
-            if (before - reached <= ENOUGH * np.tile(width, 2)).all():
+            for j in (j for j in sides if idle[j] < PATIENCE):
+                ends = np.where(agrees[:, j], signs[j] * x[:, j, -1, states[j]], np.inf)
+                i = ends.argmin()
+                gain = reached[j] - ends[i]
+                idle[j] = 0 if gain > ENOUGH * width[states[j]] else idle[j] + 1
+                reach[j] = np.abs(proposed[j] - best[j]).max(0) * (SHRINK if idle[j] else 2 * SHARES[i])
+                if gain > 0:
+                    best[j], reached[j] = x[i, j], ends[i]
+            if (idle >= PATIENCE).all():
                 break
         return Sides(reached[:n], -reached[n:])
 
-    def _proposed(self, inside: Stretch, program: RecordProgram | None, run: np.ndarray, state: int, sign: int) -> Any:
-        """A run (x, d) that is extreme to first order; None where there is none."""
-        found = (program or RecordProgram(inside, self.maps.affine(run, inside.u))).extreme(state, sign)
-        return None if found.x is None else (found.x, found.d)
+    def _program(self, inside: Stretch, run: np.ndarray, reach: np.ndarray) -> RecordProgram:
+        """Runs to first order along one, in its boxes and no further from it than that."""
+        near = Sides(*(inside.state.clip(run + side) for side in (-reach, reach)))
+        return RecordProgram(replace(inside, state=near), self.maps.affine(run, inside.u))
 
     def _first(self, inside: Stretch, stretch: Stretch) -> tuple[np.ndarray, np.ndarray] | None:
         """A run that needs little of the noise: the programs along it, one after the other."""
@@ -125,7 +136,7 @@ class AgreeingRuns:
         count, many = len(x), self.maps.many
         x, d = (np.concatenate([v, np.repeat(v[:1], many - count, 0)]) for v in (x, d))
         d = stretch.input.clip(d)
-        now = stretch.state[0].clip(x[:, 0])
+        now = stretch.state.rows(0).clip(x[:, 0])
         played, agrees = [now], np.ones(many, bool)
         for k in range(stretch.length):
             f, g = self.maps.values(now, stretch.u[k])
@@ -138,6 +149,6 @@ class AgreeingRuns:
                 agrees &= ((stretch.state.lower[k] <= now) & (now <= stretch.state.upper[k])).all(1)
             if k + 1 < stretch.length:
                 base = f + stretch.push[k] + d[:, k] @ stretch.G.T
-                now = base + stretch.w[k].clip(x[:, k + 1] - base)
+                now = base + stretch.w.rows(k).clip(x[:, k + 1] - base)
                 played.append(now)
         return np.stack(played, 1)[:count], agrees[:count]

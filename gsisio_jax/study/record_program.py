@@ -13,8 +13,8 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-# The smallest that HiGHS takes; then without its simplifications, which call unbounded programs infeasible; then what it
-# takes by itself.
+# The smallest that HiGHS takes; then without its simplifications, which call unbounded programs infeasible; then what
+# it takes by itself.
 _TIGHT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 _ATTEMPTS: tuple[dict[str, Any], ...] = (_TIGHT, _TIGHT | {"presolve": False}, {"presolve": False})
 
@@ -25,7 +25,7 @@ class Sides(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
 
-    def __getitem__(self, rows: Any) -> Sides:  # type: ignore[override]
+    def rows(self, rows: Any) -> Sides:
         return Sides(self.lower[rows], self.upper[rows])
 
     def clip(self, values: np.ndarray) -> np.ndarray:
@@ -72,7 +72,7 @@ class Stretch:
 
 
 class Extreme(NamedTuple):
-    """The value of a program, NaN where nothing agrees with the record, and a run (x, d) that has it, if there is one."""
+    """The value of a program, NaN where nothing agrees with the record, and a run (x, d) that has it, if any."""
 
     value: float
     x: np.ndarray | None = None
@@ -93,10 +93,9 @@ class RecordProgram:
         s, n = known.state.lower.shape
         seen = np.isfinite(known.y).ravel()
         step = sparse.eye_array(s * n, k=n) - sparse.block_diag([*plant.A])
-        moves = sparse.hstack([step, -sparse.kron(sparse.eye_array(s), known.G)], format="csr")[: (s - 1) * n]
-        sees = sparse.hstack(
-            [sparse.block_diag([*plant.C]), sparse.kron(sparse.eye_array(s), known.H)], format="csr"
-        )[seen]  # fmt: skip
+        moves = sparse.csr_array(sparse.hstack([step, -sparse.kron(sparse.eye_array(s), known.G)]))[: (s - 1) * n]
+        output = [sparse.block_diag([*plant.C]), sparse.kron(sparse.eye_array(s), known.H)]
+        sees = sparse.csr_array(sparse.hstack(output))[seen]
         rows = sparse.vstack([moves, sees])
         pushed, measured = (plant.a + known.push)[:-1].ravel(), (known.y - plant.c).ravel()[seen]
         low = np.concatenate([pushed + known.w.lower[:-1].ravel(), measured - known.v.upper.ravel()[seen]])

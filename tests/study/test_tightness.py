@@ -1,6 +1,5 @@
-"""Widths over those of the exact hull, against linear programs written otherwise and against recursions of intervals."""
+"""Widths over those of the exact hull, against other linear programs and against recursions of intervals."""
 
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles.record_hull import exact_hull
+from scipy.optimize import brentq
 
 import gsisio_jax as gx
 from gsisio_jax import Interval, plot
+from gsisio_jax.study import hulls
 
 A = np.array([[0.8, 0.2, 0], [-0.1, 0.9, 0.3], [0.05, -0.2, 0.7]])
 C = np.vstack([np.eye(3), [[1, 1, 0], [0, 1, -1]]])
@@ -31,9 +32,7 @@ class Record:
         noise = gx.Noise(Interval.symmetric(W), Interval.symmetric(V))
         self.initial = Interval.symmetric(START)
         self.noise = gx.Noise(Interval.symmetric(FADING * W), Interval.symmetric(FADING * V))
-        self.observer = gx.design_observer(
-            system, noise, Interval.entire(3), u_region=Interval([-2.0], [2.0]), **FAST
-        )
+        self.observer = gx.design_observer(system, noise, Interval.entire(3), u_region=Interval([-2.0], [2.0]), **FAST)
         rng = np.random.default_rng(4)
         self.u, d = 2 * np.sin(0.7 * np.arange(STEPS))[:, None], rng.normal(size=(STEPS, 2))
         x, free = rng.uniform(-START, START), np.zeros(3)
@@ -88,7 +87,7 @@ def test_a_horizon_lies_between_hull_and_box(affine, found):
 
 def test_runs_of_an_affine_plant_span_its_hull(affine, found, monkeypatch):
     """Inputs, lost entries and fading noise on the way that nonlinear plants go."""
-    monkeypatch.setattr(sys.modules["gsisio_jax.study.tightness"], "affine_plant", lambda *_: None)
+    monkeypatch.setattr(hulls, "affine_plant", lambda *_: None)
     runs = affine.run(steps=[0, 3, 8, -1])
     assert not runs.exact
     np.testing.assert_allclose(runs.hull_width, found.hull_width, rtol=1e-5)
@@ -104,22 +103,26 @@ def test_a_contradiction_leaves_no_hull(affine):
     np.testing.assert_array_equal(found.worst, found.ratio[0])
 
 
-def scalar(f, *, region=3.0, **options):
-    """x+ = f(x, u) + w, y = x + v: what is known of x[k] is an interval, if f increases."""
+def same(x):
+    return x
+
+
+def scalar(f, g=same, *, region=3.0, **options):
+    """x+ = f(x, u) + w, y = g(x) + v: what is known of x[k] is an interval, if f and g increase."""
     design = {name: options.pop(name) for name in ("form", "u_region") if name in options}
-    system = gx.System(f, lambda x: x, G=np.zeros((1, 0)), H=np.zeros((1, 0)), **options)
+    system = gx.System(f, g, G=np.zeros((1, 0)), H=np.zeros((1, 0)), **options)
     noise = gx.Noise(Interval([-0.1], [0.2]), Interval([-0.6], [0.5]))
     fast = {} if "form" in design else FAST
     return gx.design_observer(system, noise, Interval.symmetric([region]), **fast, **design)
 
 
-def recursion(f, y, u, start, predicted=False):
-    """Intervals of x[k] from y[0..k], or from y[0..k-1]."""
+def recursion(f, y, u, start, predicted=False, inverse=same):
+    """Intervals of x[k] from y[0..k], or from y[0..k-1]; `inverse` is that of g."""
     low, high, found = *start, []
     for k in range(len(y)):
         before = (low, high)
         if np.isfinite(y[k, 0]):
-            low, high = max(low, y[k, 0] - 0.5), min(high, y[k, 0] + 0.6)
+            low, high = max(low, inverse(y[k, 0] - 0.5)), min(high, inverse(y[k, 0] + 0.6))
         found.append(before if predicted else (low, high))
         low, high = f(low, u[k]) - 0.1, f(high, u[k]) + 0.2
     return np.array(found)
@@ -128,11 +131,11 @@ def recursion(f, y, u, start, predicted=False):
 U = np.array([[0.2], [0.9], [0.5], [0.1], [0.7], [0.3]])
 
 
-def measured(f):
+def measured(f, g=same):
     """A record from x[0] = 1.5; the third row is lost."""
     rng, x, y = np.random.default_rng(6), 1.5, []
     for u in U:
-        y.append([x + rng.uniform(-0.6, 0.5)])
+        y.append([g(x) + rng.uniform(-0.6, 0.5)])
         x = float(np.squeeze(f(x, u))) + rng.uniform(-0.1, 0.2)
     return np.array([*y[:2], [np.nan], *y[3:]])
 
@@ -151,11 +154,17 @@ def test_slopes_that_depend_on_a_known_input():
 
 def test_runs_of_a_nonlinear_plant_are_inside_the_hull_and_reach_its_sides():
     def f(x, u=None):
-        return 0.7 * x + 0.6 * np.sin(x) if isinstance(x, float) else 0.7 * x + 0.6 * jnp.sin(x)
+        return 0.7 * x + 0.6 * (np if isinstance(x, float) else jnp).sin(x)
 
-    observer, y = scalar(lambda x: f(x)), measured(f)
+    def g(x):
+        return x + 0.45 * (np if isinstance(x, float) else jnp).sin(2 * x)
+
+    def inverse(y):
+        return brentq(lambda x: g(float(x)) - y, -9, 9, xtol=1e-13)
+
+    observer, y = scalar(lambda x: f(x), g), measured(f, g)
     found = gx.tightness(observer, Interval([-3.0], [3.0]), y)
-    exact = recursion(f, y, U, (-3.0, 3.0))
+    exact = recursion(f, y, U, (-3.0, 3.0), inverse=inverse)
     assert not found.exact
     assert "at least as wide" in str(found)
     assert (exact[:, :1] - 1e-9 <= found.hull_lower).all()
@@ -165,7 +174,9 @@ def test_runs_of_a_nonlinear_plant_are_inside_the_hull_and_reach_its_sides():
     short = gx.tightness(observer, Interval([-3.0], [3.0]), y, steps=[4], horizon=1)
     box = gx.estimate(observer, Interval([-3.0], [3.0]), y).state
     sides = float(box.lower[3, 0]), float(box.upper[3, 0])
-    np.testing.assert_allclose(short.hull_width[0], np.diff(recursion(f, y[3:5], U, sides)[-1]), rtol=2e-3)
+    np.testing.assert_allclose(
+        short.hull_width[0], np.diff(recursion(f, y[3:5], U, sides, inverse=inverse)[-1]), rtol=2e-3
+    )
 
 
 def test_the_prediction_form_is_held_against_what_it_knows():
@@ -178,16 +189,17 @@ def test_the_prediction_form_is_held_against_what_it_knows():
 
 
 def test_bounds_of_states_and_inputs_count():
-    """x+ = x + d with 0 <= x and d in [0, 1], nothing measured: x[2] in [0, 2.5 + w]; boxes and hull infinite without."""
+    """x+ = x + d with 0 <= x and d in [0, 1], nothing measured: x[2] <= 2.9; infinite without."""
     noise = gx.Noise(Interval([-0.1], [0.2]), Interval.symmetric([0.1]))
     start, y = Interval([-1.0], [0.5]), np.full((3, 1), np.nan)
     common = {"G": [[1.0]], "H": [[0.0]]}
     known = {"state_bounds": Interval([0.0], [np.inf]), "input_bounds": Interval([0.0], [1.0])}
+    region = Interval([0.0], [4.0])
     system = gx.System(lambda x: x, lambda x: x, **common, **known)
-    found = gx.tightness(gx.design_observer(system, noise, Interval([0.0], [4.0])), start, y)
+    found = gx.tightness(gx.design_observer(system, noise, region, sweeps=1), start, y)
     np.testing.assert_allclose(found.hull_lower[:, 0], 0, atol=1e-9)
     np.testing.assert_allclose(found.hull_upper[:, 0], [0.5, 1.7, 2.9])
-    free = gx.design_observer(gx.System(lambda x: x, lambda x: x, **common), noise, Interval([0.0], [4.0]))
+    free = gx.design_observer(gx.System(lambda x: x, lambda x: x, **common), noise, region, sweeps=1)
     found = gx.tightness(free, start, y, steps=[2])
     assert np.isinf([found.hull_lower, found.hull_upper]).all()
     assert found.ratio.tolist() == [[1.0]]

@@ -99,7 +99,9 @@ class Tightness:
                 f"  {f'x{i + 1}':<6}{self.mean[i]:>11.4g}{self.worst[i]:>11.4g}{at:>9}{width:>13.4g}{hull:>13.4g}"
             )
         if not self.exact:
-            lines.append("  f or g is not affine: the hull is at least as wide as these runs, and a ratio is the most that can be gained")
+            lines.append(
+                "  f or g is not affine: the hull is at least as wide as these runs; no more than the ratio can be gained"
+            )
         if (none := self.steps[np.isnan(self.ratio).any(axis=1)]).size:
             said = "agrees with the record" if self.exact else "was found"
             lines.append(f"  no run {said} at steps {', '.join(map(str, none))}")
@@ -156,6 +158,10 @@ def tightness(
     >>> y = 0.03 * np.sin(np.arange(40.0)).reshape(20, 2)
     >>> found = gx.tightness(observer, gx.Interval.symmetric([3.0, 3.0]), y, steps=[9, 19])
     >>> print(found)
+    Widths of boxes over those of the exact hull of the whole record, 2 steps from 9 to 19
+      state        mean      worst  at step   mean width  of the hull
+      x1              1          1        9          0.1          0.1
+      x2          5.909      7.439        9        1.671       0.2833
     """
     call = "tightness"
     _, y_ready, u_ready, bounds, _ = prepare(call, observer, initial, y, u, noise, rows=True)
@@ -173,7 +179,7 @@ def tightness(
     record = _record(system, y if np.ndim(y) == 2 else y_ready, u_ready, bounds)
     affine = affine_plant(system, record.u)
     found = _hulls(observer, record, affine, boxes, _sides(initial), chosen, horizon)
-    return Tightness(chosen, *boxes[chosen], *found, affine is not None, horizon)
+    return Tightness(chosen, *boxes.rows(chosen), *found, affine is not None, horizon)
 
 
 def _chosen(steps: Sequence[int] | None, rows: int) -> np.ndarray:
@@ -252,12 +258,12 @@ def _hulls(
     found = []
     for k in chosen:
         first = 0 if horizon is None else max(k - horizon, 0)
-        begin = boxes[first] if first else initial
+        begin = boxes.rows(first) if first else initial
         stretch = _cut(record, first, k, begin, last=not isinstance(observer, PredictionObserver))
         if affine is not None:
             found.append(exact_hull(stretch, affine.rows(slice(first, k + 1))))
         elif runs is not None:
-            found.append(runs.hull(stretch, _met(stretch.state, boxes[first : k + 1])))
+            found.append(runs.hull(stretch, _met(stretch.state, boxes.rows(slice(first, k + 1)))))
     return Sides(*(np.array(side) for side in zip(*found, strict=True)))
 
 
@@ -277,8 +283,16 @@ def _cut(record: Stretch, first: int, last_row: int, begin: Sides, last: bool) -
     y = record.y[rows].copy()
     if not last:
         y[-1] = np.nan
-    state = Sides(*(side[rows].copy() for side in record.state))
+    state = Sides(*(side.copy() for side in record.state.rows(rows)))
     state.lower[0], state.upper[0] = np.maximum(state.lower[0], begin.lower), np.minimum(state.upper[0], begin.upper)
     return Stretch(
-        record.G, record.H, y, record.push[rows], record.u[rows], record.w[rows], record.v[rows], state, record.input
+        record.G,
+        record.H,
+        y,
+        record.push[rows],
+        record.u[rows],
+        record.w.rows(rows),
+        record.v.rows(rows),
+        state,
+        record.input,
     )
