@@ -1,8 +1,8 @@
 """Pictures: boxes over time, their widths, heat maps and curves of studies, labelled without being asked.
 
 `framers` draws boxes over time, `widths` their widths beside what the certificate promises, `funnel` many boxes closing
-in. `heatmap` and `curves` draw what a study kept over the axes that it varied; `tightness` draws widths over those of the exact
-hull. `save` writes `framers` into a file.
+in. `heatmap` and `curves` draw what a study kept over the axes that it varied; `tightness` draws widths over those of
+the exact hull. `save` writes `framers` into a file.
 matplotlib is imported when a picture is drawn, never before.
 """
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from gsisio_jax.plant.system import System
 from gsisio_jax.scalar.numpy_program import numpy_function
-from gsisio_jax.study.record_program import Affine, RecordProgram, Sides, Stretch
+from gsisio_jax.study.record_program import RecordProgram
+from gsisio_jax.study.stretch import Affine, Sides, Stretch
 
 # How far to go from a run in the middle towards the one that a program proposes.
 SHARES = 1 - np.array([0, 1e-7, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9, 0.98, 0.998])

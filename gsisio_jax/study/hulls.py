@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,102 +15,10 @@ from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.rounding_constants import slopes_of
 from gsisio_jax.plant.system import Noise, System
 from gsisio_jax.scalar.numpy_program import numpy_function
-
-if TYPE_CHECKING:
-    from gsisio_jax.study.record_program import Affine, Sides, Stretch
+from gsisio_jax.study.stretch import Affine, Sides, Stretch
+from gsisio_jax.study.tightness_result import Tightness
 
 STEPS = 10
-
-
-@dataclass(frozen=True)
-class Tightness:
-    """How near to the hull the boxes of a record are. Print it; draw it with `plot`.
-
-    Attributes:
-        steps: the steps k that were looked at, (K,).
-        lower, upper: the observer's boxes of x[k], (K, n), units of the states.
-        hull_lower, hull_upper: the hull of all x[k] that agree with the record, (K, n); NaN where no run does
-            (`exact`), or where none was found.
-        exact: f and g are affine on the state bounds, and the hull is exact. Otherwise it is that of the runs that
-            were found: a lower bound of the hull's width, so that `ratio` is an upper bound of what is left to gain.
-        horizon: number of steps that the hull looks back, or None for all.
-    """
-
-    steps: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    hull_lower: np.ndarray
-    hull_upper: np.ndarray
-    exact: bool
-    horizon: int | None
-
-    @property
-    def width(self) -> np.ndarray:
-        """Widths of the boxes, (K, n)."""
-        return self.upper - self.lower
-
-    @property
-    def hull_width(self) -> np.ndarray:
-        """Widths of the hull, (K, n): where not `exact`, lower bounds of them."""
-        return self.hull_upper - self.hull_lower
-
-    @property
-    def ratio(self) -> np.ndarray:
-        """Width of the box over that of the hull, (K, n); 1 where both are 0 or both infinite."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = self.width / self.hull_width
-        same = (self.width == self.hull_width) & ((self.width == 0) | np.isinf(self.width))
-        return np.where(same, 1.0, ratio)
-
-    @property
-    def mean(self) -> np.ndarray:
-        """Mean ratio of every state over the steps that have one, (n,)."""
-        return self._over_steps(np.mean)
-
-    @property
-    def worst(self) -> np.ndarray:
-        """Largest ratio of every state, (n,)."""
-        return self._over_steps(np.max)
-
-    def _over_steps(self, of: Any) -> np.ndarray:
-        return np.array([of(row[~np.isnan(row)]) if not np.isnan(row).all() else np.nan for row in self.ratio.T])
-
-    @property
-    def against(self) -> str:
-        """What the boxes are compared with, in words."""
-        over = "the whole record" if self.horizon is None else f"the last {self.horizon} steps and the box before"
-        return f"the exact hull of {over}" if self.exact else f"the runs found that agree with {over}"
-
-    def __str__(self) -> str:
-        lines = [
-            f"Widths of boxes over those of {self.against}, {len(self.steps)} steps from {self.steps[0]} to "
-            f"{self.steps[-1]}",
-            f"  {'state':<6}{'mean':>11}{'worst':>11}{'at step':>9}{'mean width':>13}{'of the hull':>13}",
-        ]
-        for i, ratio in enumerate(self.ratio.T):
-            known = ~np.isnan(ratio)
-            if not known.any():
-                lines.append(f"  {f'x{i + 1}':<6}{'-':>11}{'-':>11}{'-':>9}{'-':>13}{'-':>13}")
-                continue
-            at = self.steps[known][ratio[known].argmax()]
-            width, hull = (w[known, i].mean() for w in (self.width, self.hull_width))
-            lines.append(
-                f"  {f'x{i + 1}':<6}{self.mean[i]:>11.4g}{self.worst[i]:>11.4g}{at:>9}{width:>13.4g}{hull:>13.4g}"
-            )
-        if not self.exact:
-            lines.append(
-                "  f or g is not affine: the hull is at least as wide as these runs; no more than the ratio can be gained"
-            )
-        if (none := self.steps[np.isnan(self.ratio).any(axis=1)]).size:
-            said = "agrees with the record" if self.exact else "was found"
-            lines.append(f"  no run {said} at steps {', '.join(map(str, none))}")
-        return "\n".join(lines)
-
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the ratio of every state over the steps: `gsisio_jax.plot.tightness`."""
-        from gsisio_jax.plot import tightness
-
-        return tightness(self, ax)
 
 
 def tightness(
@@ -149,6 +56,7 @@ def tightness(
 
     Raises:
         ValueError: as `estimate`; a step is not in the record, the horizon is below 1, or the system is periodic.
+        RuntimeError: HiGHS fails on a program.
 
     >>> import gsisio_jax as gx
     >>> turn = 0.95 * np.array([[0.955, -0.296], [0.296, 0.955]])
@@ -164,19 +72,18 @@ def tightness(
       x2          5.909      7.439        9        1.671       0.2833
     """
     call = "tightness"
-    _, y_ready, u_ready, bounds, _ = prepare(call, observer, initial, y, u, noise, rows=True)
+    u_ready = prepare(call, observer, initial, y, u, noise, rows=True)[2]
     system = observer.system
     if system.periodic or system.periodic_states:
         raise ValueError(
             f"{call}: the system is periodic, so what agrees with the record is no convex set; unwrap the outputs "
             "(numpy.unwrap) and leave `periodic` and `periodic_states` out of the System"
         )
-    rows = len(y_ready)
-    chosen = _chosen(steps, rows)
+    chosen = _chosen(steps, len(u_ready))
     if horizon is not None and (isinstance(horizon, bool) or int(horizon) != horizon or horizon < 1):
         raise ValueError(f"{call}: `horizon` must be a number of steps of at least 1, or None, got {horizon!r}")
     boxes = _sides(estimate(observer, initial, y, u, noise).state)
-    record = _record(system, y if np.ndim(y) == 2 else y_ready, u_ready, bounds)
+    record = _record(system, y, u_ready, observer.noise if noise is None else noise)
     affine = affine_plant(system, record.u)
     found = _hulls(observer, record, affine, boxes, _sides(initial), chosen, horizon)
     return Tightness(chosen, *boxes.rows(chosen), *found, affine is not None, horizon)
@@ -196,16 +103,12 @@ def _chosen(steps: Sequence[int] | None, rows: int) -> np.ndarray:
 
 
 def _sides(box: Interval, shape: tuple[int, ...] | None = None) -> Sides:
-    from gsisio_jax.study.record_program import Sides
-
     lower, upper = (np.asarray(side, np.float64) for side in (box.lower, box.upper))
     return Sides(lower, upper) if shape is None else Sides(np.broadcast_to(lower, shape), np.broadcast_to(upper, shape))
 
 
 def _record(system: System, y: Any, u: Any, noise: Noise) -> Stretch:
     """The whole record, with the state bounds for all of its rows."""
-    from gsisio_jax.study.record_program import Stretch
-
     G, H, B, D, y, u = (np.asarray(a, np.float64) for a in (system.G, system.H, system.B, system.D, y, u))
     states = (len(y), system.n)
     return Stretch(
@@ -216,21 +119,19 @@ def _record(system: System, y: Any, u: Any, noise: Noise) -> Stretch:
 
 def affine_plant(system: System, u: np.ndarray) -> Affine | None:
     """f and g at every row of u (T, m), if they are affine in x on the state bounds; else None."""
-    from gsisio_jax.study.record_program import Affine
-
     bounds = system.state_bounds
     slopes_on = slopes_of(system, np.zeros((0, system.l)), Interval(u.min(axis=0), u.max(axis=0)))
-    slopes = [slopes_on(bounds)]
-    if not slopes[0].affine:
-        if not system.takes_u:
-            return None
+    slopes, which = [slopes_on(bounds)], np.zeros(len(u), int)
+    if not slopes[0].affine and system.takes_u:
+        different, which = np.unique(u, axis=0, return_inverse=True)
         slopes = []
-        for row in u:
+        for row in different:
             slopes.append(slopes_on(bounds, Interval(row, row)))
             if not slopes[-1].affine:
-                return None
-    slopes = slopes * (len(u) // len(slopes))
-    A, C = (np.array([getattr(s, name) for s in slopes]) for name in ("F", "E"))
+                break
+    if not slopes[-1].affine:
+        return None
+    A, C = (np.array([getattr(one, name) for one in slopes])[which] for name in ("F", "E"))
     x = np.tile(_sides(bounds).clip(np.zeros(system.n)), (len(u), 1))
 
     def both(x: Any, u: Any) -> tuple[Any, Any]:
@@ -251,7 +152,7 @@ def _hulls(
     horizon: int | None,
 ) -> Sides:
     from gsisio_jax.study.agreeing_runs import AgreeingRuns
-    from gsisio_jax.study.record_program import Sides, exact_hull
+    from gsisio_jax.study.record_program import exact_hull
 
     longest = int(chosen[-1]) + 1 if horizon is None else min(horizon, int(chosen[-1])) + 1
     runs = None if affine is not None else AgreeingRuns(observer.system, longest)
@@ -259,7 +160,7 @@ def _hulls(
     for k in chosen:
         first = 0 if horizon is None else max(k - horizon, 0)
         begin = boxes.rows(first) if first else initial
-        stretch = _cut(record, first, k, begin, last=not isinstance(observer, PredictionObserver))
+        stretch = record.cut(first, k, begin, measured=not isinstance(observer, PredictionObserver))
         if affine is not None:
             found.append(exact_hull(stretch, affine.rows(slice(first, k + 1))))
         elif runs is not None:
@@ -269,30 +170,5 @@ def _hulls(
 
 def _met(a: Sides, b: Sides) -> Sides:
     """The intersection, and the first where they miss each other or where a side of the second is NaN."""
-    from gsisio_jax.study.record_program import Sides
-
     lower, upper = np.fmax(a.lower, b.lower), np.fmin(a.upper, b.upper)
     return Sides(np.where(lower <= upper, lower, a.lower), np.where(lower <= upper, upper, a.upper))
-
-
-def _cut(record: Stretch, first: int, last_row: int, begin: Sides, last: bool) -> Stretch:
-    """Rows of a record, begun in a box; without the last measurement where that does not count."""
-    from gsisio_jax.study.record_program import Sides, Stretch
-
-    rows = slice(first, last_row + 1)
-    y = record.y[rows].copy()
-    if not last:
-        y[-1] = np.nan
-    state = Sides(*(side.copy() for side in record.state.rows(rows)))
-    state.lower[0], state.upper[0] = np.maximum(state.lower[0], begin.lower), np.minimum(state.upper[0], begin.upper)
-    return Stretch(
-        record.G,
-        record.H,
-        y,
-        record.push[rows],
-        record.u[rows],
-        record.w.rows(rows),
-        record.v.rows(rows),
-        state,
-        record.input,
-    )

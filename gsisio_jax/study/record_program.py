@@ -13,70 +13,22 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-# The smallest that HiGHS takes; then without its simplifications, which call unbounded programs infeasible; then what
-# it takes by itself.
+from gsisio_jax.study.stretch import Affine, Sides, Stretch
+
+# The smallest tolerance that HiGHS takes; then without its simplifications, which call unbounded programs infeasible;
+# then its own tolerance, for records of large numbers.
 _TIGHT = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
 _ATTEMPTS: tuple[dict[str, Any], ...] = (_TIGHT, _TIGHT | {"presolve": False}, {"presolve": False})
 
 
-class Sides(NamedTuple):
-    """Lower and upper bounds in NumPy, float64; empty where they are crossed."""
-
-    lower: np.ndarray
-    upper: np.ndarray
-
-    def rows(self, rows: Any) -> Sides:
-        return Sides(self.lower[rows], self.upper[rows])
-
-    def clip(self, values: np.ndarray) -> np.ndarray:
-        return np.clip(values, self.lower, self.upper)
-
-
-class Affine(NamedTuple):
-    """``f = A x + a`` and ``g = C x + c`` at every row: (s, n, n), (s, n), (s, l, n), (s, l)."""
-
-    A: np.ndarray
-    a: np.ndarray
-    C: np.ndarray
-    c: np.ndarray
-
-    def rows(self, rows: slice) -> Affine:
-        return Affine(*(part[rows] for part in self))
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """What is known of s successive rows of a record.
-
-    Attributes:
-        G, H: (n, p), (l, p).
-        y: (s, l), without ``D u``; NaN where missing. push: ``B u``, (s, n). u: (s, m).
-        w, v: bounds of the noise, (s, n) and (s, l).
-        state: bounds of the states, (s, n), the first row being the box that the stretch begins in.
-        input: bounds of the unknown inputs, (p,).
-    """
-
-    G: np.ndarray
-    H: np.ndarray
-    y: np.ndarray
-    push: np.ndarray
-    u: np.ndarray
-    w: Sides
-    v: Sides
-    state: Sides
-    input: Sides
-
-    @property
-    def length(self) -> int:
-        return len(self.y)
-
-
 class Extreme(NamedTuple):
-    """The value of a program, NaN where nothing agrees with the record, and a run (x, d) that has it, if any."""
+    """The value of a program, NaN where nothing agrees with the record, and a run (x, d) that has it, if any; or why
+    the program could not be solved."""
 
     value: float
     x: np.ndarray | None = None
     d: np.ndarray | None = None
+    failure: str = ""
 
 
 @dataclass(frozen=True)
@@ -130,14 +82,23 @@ class RecordProgram:
             if found.status == 0:
                 x, d = np.split(found.x[:-1], [s * n])
                 return Extreme(sign * found.fun, x.reshape(s, n), d.reshape(s, p))
-            if found.status in (2, 3) and "presolve" in options:
-                return Extreme(np.nan if found.status == 2 else -sign * np.inf)
-        raise RuntimeError(f"tightness: HiGHS could not solve a program of {s} rows: {found.message}")
+            if found.status == 3 and "presolve" in options:
+                return Extreme(-sign * np.inf)
+        return Extreme(np.nan, failure="" if found.status == 2 else found.message)
 
 
 def exact_hull(stretch: Stretch, plant: Affine) -> Sides:
-    """The hull (n,) of the last state over all runs that agree with the stretch; NaN where none does."""
+    """The hull (n,) of the last state over all runs that agree with the stretch; NaN where none does.
+
+    Raises:
+        RuntimeError: a program could not be solved.
+    """
     program = RecordProgram(stretch, plant)
     n = stretch.state.lower.shape[1]
-    sides = np.array([[program.extreme(i, sign).value for i in range(n)] for sign in (1, -1)])
-    return Sides(*sides)
+    ends = [[program.extreme(i, sign) for i in range(n)] for sign in (1, -1)]
+    if failure := next((end.failure for side in ends for end in side if end.failure), ""):
+        raise RuntimeError(
+            f"tightness: HiGHS could not solve a program of {stretch.length} rows ({failure}); try a shorter horizon, "
+            "or units in which states and outputs are of like size"
+        )
+    return Sides(*(np.array([end.value for end in side]) for side in ends))
