@@ -20,7 +20,7 @@ from gsisio_jax.plant.system import Noise, System
 if TYPE_CHECKING:
     from gsisio_jax import dataset, examples, paper, plot, study, tuning
     from gsisio_jax.design import design_observer
-    from gsisio_jax.study import grid, monte_carlo, sweep
+    from gsisio_jax.study import grid, monte_carlo, sweep, tightness
     from gsisio_jax.tuning import allocate, tune_noise, width_sensitivity
 
 __all__ = [
@@ -60,6 +60,7 @@ __all__ = [
     "step",
     "study",
     "sweep",
+    "tightness",
     "tune_noise",
     "tuning",
     "width_sensitivity",
@@ -72,6 +73,7 @@ _LAZY = {
     "grid": "gsisio_jax.study",
     "monte_carlo": "gsisio_jax.study",
     "sweep": "gsisio_jax.study",
+    "tightness": "gsisio_jax.study",
     "tune_noise": "gsisio_jax.tuning",
     "width_sensitivity": "gsisio_jax.tuning",
     "dataset": "",

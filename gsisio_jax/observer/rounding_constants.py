@@ -69,9 +69,9 @@ class Slopes(eqx.Module):
         return self.near_affine(self.F_radius, self.E_radius, self.Z_radius)
 
 
-def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) -> Callable[[Interval], Slopes]:
-    """Enclosures of the Jacobians as a function of the box, uniformly over `u_box`; traced once for all boxes, run in
-    NumPy, and computed in that type whatever JAX is set to."""
+def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) -> Callable[..., Slopes]:
+    """Enclosures of the Jacobians as a function of the box (and of that of u), uniformly over `u_box` where no other is
+    given; traced once for all boxes, run in NumPy, and computed in that type whatever JAX is set to."""
 
     def enclose(box: Interval, u: Interval) -> list[Interval]:
         T2_array = jnp.asarray(np.asarray(T2), dtype)
@@ -80,9 +80,9 @@ def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) ->
 
     program: list[Callable[..., list[Interval]]] = []
 
-    def on(box: Interval) -> Slopes:
+    def on(box: Interval, u: Interval = u_box) -> Slopes:
         with _able_to_hold(dtype):
-            boxes = known(box, dtype), known(u_box, dtype)
+            boxes = known(box, dtype), known(u, dtype)
             if not program:
                 program.append(numpy_function(enclose, *boxes))
             parts = [_center_and_distance(jacobian) for jacobian in program[0](*boxes)]

@@ -14,8 +14,8 @@ def exact_hull(A: Any, C: Any, w: Any, v: Any, start: Any, y: Any, G: Any = None
 
     Args:
         A, C: (n, n) and (l, n).
-        w, v, start: bounds of magnitudes, (n,), (l,) and (n,).
-        y: (T, l).
+        w, v, start: bounds of magnitudes, (n,), (l,) and (n,); w and v also (T, n) and (T, l).
+        y: (T, l); NaN where missing.
         G, H: (n, p) and (l, p); None without an unknown input.
     """
     steps, n = len(y), len(A)
@@ -26,9 +26,11 @@ def exact_hull(A: Any, C: Any, w: Any, v: Any, start: Any, y: Any, G: Any = None
     begins = sparse.eye_array(n, moves.shape[1])
     rows = sparse.vstack([moves, sees, begins])
     center = np.concatenate([np.zeros((steps - 1) * n), np.ravel(y), np.zeros(n)])
-    radius = np.concatenate([np.tile(w, steps - 1), np.tile(v, steps), start])
+    w, v = np.broadcast_to(w, (steps, n)), np.broadcast_to(v, np.shape(y))
+    radius = np.concatenate([np.ravel(w[:-1]), np.ravel(v), start])
     limits = np.concatenate([center + radius, radius - center])
-    both = sparse.csr_array(sparse.vstack([rows, -rows]))
+    known = np.isfinite(limits)
+    both, limits = sparse.csr_array(sparse.vstack([rows, -rows]))[known], limits[known]
     width = []
     for i in range(n):
         cost = np.zeros(moves.shape[1])
