@@ -1,5 +1,6 @@
 """Windows: as tight as the exact program nearly, and certain after conflicts, gaps and in every way of running."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -11,6 +12,7 @@ from oracles.record_hull import exact_hull
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
+from gsisio_jax.observer.window import Window
 
 ANGLE = 0.3
 TURN = 0.95 * np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
@@ -139,6 +141,24 @@ def test_float32():
     assert (np.asarray(boxes.lower) <= x + slack).all()
     assert (x - slack <= np.asarray(boxes.upper)).all()
     np.testing.assert_allclose(boxes.width, run(rotation(4), y).state.width, rtol=2e-3)
+
+
+def test_a_constant_meets_the_rounding_of_all_lags():
+    """x = 1 always. Each of 39 lags adds .49 ulp, which is lost beside the 1 of the first one, and the last takes all
+    of them away. Any multipliers are a correct row, as f has no slope; no design chooses these."""
+    steps, ulp = 40, np.finfo(float).eps
+    system = gx.System(lambda x: 0 * x + 1, lambda x: x, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
+    noise = gx.Noise(Interval.symmetric([0.0]), Interval.symmetric([1.0]))
+    observer = gx.design_observer(system, noise, Interval.symmetric([5.0]), missing=False)
+    multipliers = np.zeros((steps, 1, 2))
+    multipliers[:, 0, 0] = [1, *(-0.49 * ulp * np.arange(1, steps))]
+    nothing = np.zeros((1, 1))
+    row = Window(
+        multipliers, nothing, nothing, np.zeros((steps, 1, 0)), nothing, np.zeros((steps, 1, 0)), (0,), (1,) * steps
+    )
+    one = Interval([1.0], [1.0])
+    box = gx.estimate(replace(observer, window=row), one, np.ones((steps + 2, 1))).state
+    assert held(box, np.ones(1)).all()
 
 
 @pytest.mark.parametrize(
