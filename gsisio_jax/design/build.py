@@ -171,10 +171,11 @@ def _check(
     system.check_unchanged("design_observer")
     if gains < 1 or sweeps < 1:
         raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
-    if window < 1 or (window > 1 and (form == "prediction" or system.periodic_states)):
+    whole = isinstance(window, int | np.integer)
+    if not whole or window < 1 or (window > 1 and (form == "prediction" or system.periodic_states)):
         raise ValueError(
-            "design_observer: `window` must be a number of steps, at least 1, and 1 in the prediction form and where "
-            f"states are periodic (boxes of different steps may lie a period apart), got {window}"
+            "design_observer: `window` must be a whole number of steps, at least 1, and 1 in the prediction form and "
+            f"where states are periodic (boxes of different steps may lie a period apart), got {window!r}"
         )
     for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
         if box.shape != (size,):

@@ -12,6 +12,7 @@ from oracles.record_hull import exact_hull
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
+from gsisio_jax.observer.residuals import window_residual
 from gsisio_jax.observer.window import Window
 
 ANGLE = 0.3
@@ -143,6 +144,28 @@ def test_float32():
     np.testing.assert_allclose(boxes.width, run(rotation(4), y).state.width, rtol=2e-3)
 
 
+def test_what_rows_leave_of_states_and_inputs_is_counted():
+    """Multipliers that are off by a thousandth still make correct rows, as what they leave is bounded with the box of
+    the input of each step. It is large every third step, so that of another step would not do."""
+    A, G, C = np.array([[0.9, 0.3], [-0.3, 0.8]]), np.array([[1.0], [0.5]]), np.array([[1.0, 0.0], [0.2, 1.0], [1, 1]])
+    system = gx.System(lambda x: A @ x, lambda x: C @ x, G=G, H=np.zeros((3, 1)))
+    bounds = gx.Noise(Interval.symmetric(np.full(2, 1e-3)), Interval.symmetric(np.full(3, 1e-2)))
+    observer = gx.design_observer(system, bounds, Interval.entire(2), missing=False, window=3)
+    rng = np.random.default_rng(0)
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf) * (1 + 1e-3 * rng.standard_normal(leaf.shape)), observer.window)
+    left = window_residual(rows, system, observer.C, observer.bounded_inputs, np.zeros((3, 1)))
+    rows = replace(rows, output=rows.remainder @ observer.T2, left_x=left[0], left_d=left[1])
+    assert left[1].max() > 1e-5
+    x, states, seen = np.zeros(2), [], []
+    for k in range(30):
+        states.append(x)
+        seen.append(C @ x + rng.uniform(-1e-2, 1e-2, 3))
+        x = A @ x + G @ rng.uniform(1e5, 2e5, 1) * (k % 3 == 0) + rng.uniform(-1e-3, 1e-3, 2)
+    est = gx.estimate(replace(observer, window=rows), Interval.symmetric(np.ones(2)), np.array(seen))
+    assert held(est.state, np.array(states)).all()
+    assert not (np.asarray(est.status) & gx.Status.CONFLICT).any()
+
+
 def test_a_constant_meets_the_rounding_of_all_lags():
     """x = 1 always. Each of 39 lags adds .49 ulp, which is lost beside the 1 of the first one, and the last takes all
     of them away. Any multipliers are a correct row, as f has no slope; no design chooses these."""
@@ -163,7 +186,11 @@ def test_a_constant_meets_the_rounding_of_all_lags():
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"window": 0}, "at least 1"), ({"window": 2, "form": "prediction"}, "prediction form")],
+    [
+        ({"window": 0}, "at least 1"),
+        ({"window": 2.0}, "whole number"),
+        ({"window": 2, "form": "prediction"}, "prediction form"),
+    ],
 )
 def test_windows_that_cannot_be(options, words):
     system = gx.System(lambda x: TURN @ x, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)))
