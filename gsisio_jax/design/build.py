@@ -179,8 +179,10 @@ def _check(
     system.check_unchanged("design_observer")
     if gains < 1 or sweeps < 1:
         raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
-    if window != "auto" and (isinstance(window, str) or window < 1):
-        raise ValueError(f'design_observer: `window` must be a number of steps, at least 1, or "auto", got {window!r}')
+    if window != "auto" and (not isinstance(window, int | np.integer) or window < 1):
+        raise ValueError(
+            f'design_observer: `window` must be a whole number of steps, at least 1, or "auto", got {window!r}'
+        )
     if window != 1 and (form == "prediction" or system.periodic_states):
         raise ValueError(
             "design_observer: `window` must be 1 in the prediction form and where states are periodic (boxes of "

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.atoms import AtomBounds, States
+from gsisio_jax.inclusion.atoms import AtomBounds, States, wider
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, entire_like, magnitude
 from gsisio_jax.interval.image import image, loose_matvec_upper, plain_image, widened_for_sums
@@ -137,10 +137,12 @@ def contract(
         lost: bounds the inputs of the last step.
     """
     window, system = maps.observer.window, maps.observer.system
-    n, _dtype = system.n, y.dtype
+    n = system.n
     pasts = (_last(carry, lost.magnitudes(domain.box)[1]), *carry.older)
     total = plain_image(window.output, widened_for_sums(output_box(system, y, u, noise.v), system.l + window.terms))
     holds = jnp.ones(len(window.targets), bool)
+    # Constants are widened for the sum of one row; here they go on through those of all lags.
+    constants: Any = jnp.zeros(len(window.targets), y.dtype)
     for lag, (past, count) in enumerate(zip(pasts, window.counts, strict=True)):
         multipliers = window.multipliers[lag][:count]
         # f and g jointly on the box of that step, slopes combined first; then what is known of it.
@@ -150,6 +152,7 @@ def contract(
         known = plain_image(weights, _known(maps.observer, past, weights.shape[-1] + window.terms))
         part = Interval.unchecked(found.lower + known.lower, found.upper + known.upper)
         total = Interval.unchecked(_added(total.lower, part.lower), _added(total.upper, part.upper))
+        constants = _added(constants, abs(rows.constant))
         measured = (multipliers[:, n:] != 0).any(-1)
         holds = jnp.concatenate([holds[:count] & past.trusted & (~measured | past.believed), holds[count:]])
     # The part of x[k] itself, psi, on the box so far.
@@ -158,6 +161,8 @@ def contract(
     loose = scale(abs(slope), states.radius).sum(-1) + scale(abs(window.remainder), psi.radius).sum(-1)
     # Slopes that were combined are off by what they are made of.
     loose = loose + scale(abs(window.remainder), scale(abs(psi.slope), states.error).sum(-1)).sum(-1)
+    constants = constants + scale(abs(window.remainder), abs(psi.center) + psi.radius).sum(-1)
+    loose = loose + wider(constants, system.l + window.terms)
     box = Interval.unchecked(total.lower - (middle + loose), total.upper - (middle - loose))
     if rounding.outward():
         left = jnp.concatenate([window.left_x, *window.left_d], -1)

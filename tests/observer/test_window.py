@@ -1,5 +1,6 @@
 """Windows: as tight as the exact program nearly, and certain after conflicts, gaps and in every way of running."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -11,6 +12,8 @@ from oracles.record_hull import exact_hull
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
+from gsisio_jax.observer.residuals import window_residual
+from gsisio_jax.observer.window import Window
 
 ANGLE = 0.3
 TURN = 0.95 * np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
@@ -150,11 +153,52 @@ def test_auto_takes_a_window_only_where_it_is_worth_it(w, worth):
     assert (observer.window is not None) == worth
 
 
+def test_what_rows_leave_of_states_and_inputs_is_counted():
+    """Multipliers that are off by a thousandth still make correct rows, as what they leave is bounded with the box of
+    the input of each step. It is large every third step, so that of another step would not do."""
+    A, G, C = np.array([[0.9, 0.3], [-0.3, 0.8]]), np.array([[1.0], [0.5]]), np.array([[1.0, 0.0], [0.2, 1.0], [1, 1]])
+    system = gx.System(lambda x: A @ x, lambda x: C @ x, G=G, H=np.zeros((3, 1)))
+    bounds = gx.Noise(Interval.symmetric(np.full(2, 1e-3)), Interval.symmetric(np.full(3, 1e-2)))
+    observer = gx.design_observer(system, bounds, Interval.entire(2), missing=False, window=3)
+    rng = np.random.default_rng(0)
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf) * (1 + 1e-3 * rng.standard_normal(leaf.shape)), observer.window)
+    left = window_residual(rows, system, observer.C, observer.bounded_inputs, np.zeros((3, 1)))
+    rows = replace(rows, output=rows.remainder @ observer.T2, left_x=left[0], left_d=left[1])
+    assert left[1].max() > 1e-5
+    x, states, seen = np.zeros(2), [], []
+    for k in range(30):
+        states.append(x)
+        seen.append(C @ x + rng.uniform(-1e-2, 1e-2, 3))
+        x = A @ x + G @ rng.uniform(1e5, 2e5, 1) * (k % 3 == 0) + rng.uniform(-1e-3, 1e-3, 2)
+    est = gx.estimate(replace(observer, window=rows), Interval.symmetric(np.ones(2)), np.array(seen))
+    assert held(est.state, np.array(states)).all()
+    assert not (np.asarray(est.status) & gx.Status.CONFLICT).any()
+
+
+def test_a_constant_meets_the_rounding_of_all_lags():
+    """x = 1 always. Each of 39 lags adds .49 ulp, which is lost beside the 1 of the first one, and the last takes all
+    of them away. Any multipliers are a correct row, as f has no slope; no design chooses these."""
+    steps, ulp = 40, np.finfo(float).eps
+    system = gx.System(lambda x: 0 * x + 1, lambda x: x, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
+    noise = gx.Noise(Interval.symmetric([0.0]), Interval.symmetric([1.0]))
+    observer = gx.design_observer(system, noise, Interval.symmetric([5.0]), missing=False)
+    multipliers = np.zeros((steps, 1, 2))
+    multipliers[:, 0, 0] = [1, *(-0.49 * ulp * np.arange(1, steps))]
+    nothing = np.zeros((1, 1))
+    row = Window(
+        multipliers, nothing, nothing, np.zeros((steps, 1, 0)), nothing, np.zeros((steps, 1, 0)), (0,), (1,) * steps
+    )
+    one = Interval([1.0], [1.0])
+    box = gx.estimate(replace(observer, window=row), one, np.ones((steps + 2, 1))).state
+    assert held(box, np.ones(1)).all()
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"window": 0}, "at least 1"),
-        ({"window": "long"}, "number of steps"),
+        ({"window": "long"}, "whole number"),
+        ({"window": 2.0}, "whole number"),
         ({"window": 2, "form": "prediction"}, "prediction form"),
     ],
 )
