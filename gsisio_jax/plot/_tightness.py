@@ -43,6 +43,7 @@ def tightness(found: Any, ax: Any = None) -> Any:
     style.fit(axis, [ratio, np.ones(1)])
     axis.grid(alpha=0.25)
     axis.set_xlabel("step")
+    axis.xaxis.get_major_locator().set_params(integer=True)
     axis.set_ylabel("width / width of the hull" + ("" if found.exact else ",\nat most"))
     if figure is not None:
         style.complete(figure, axes, f"Boxes against {found.against}")

@@ -49,7 +49,7 @@ def tightness(
         steps: the steps to look at, negative ones from the end; None: ten, spread evenly over the record, with the
             last. A step costs 2 n linear programs of all rows before it, several times that for nonlinear plants.
         horizon: look back so many steps only, from the observer's own box then; None: the whole record. This hull is
-            no narrower than that of the record, and the ratio says what a longer window would bring at most.
+            no narrower than that of the record; the ratio says what an exact window of that length would bring.
 
     Returns:
         `Tightness`. Rows in which nothing agrees with the record (a conflict) are NaN.

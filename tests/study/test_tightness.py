@@ -107,13 +107,13 @@ def same(x):
     return x
 
 
-def scalar(f, g=same, *, region=3.0, **options):
+def scalar(f, g=same, **options):
     """x+ = f(x, u) + w, y = g(x) + v: what is known of x[k] is an interval, if f and g increase."""
     design = {name: options.pop(name) for name in ("form", "u_region") if name in options}
     system = gx.System(f, g, G=np.zeros((1, 0)), H=np.zeros((1, 0)), **options)
     noise = gx.Noise(Interval([-0.1], [0.2]), Interval([-0.6], [0.5]))
     fast = {} if "form" in design else FAST
-    return gx.design_observer(system, noise, Interval.symmetric([region]), **fast, **design)
+    return gx.design_observer(system, noise, Interval.symmetric([3.0]), **fast, **design)
 
 
 def recursion(f, y, u, start, predicted=False, inverse=same):
