@@ -23,6 +23,7 @@ from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.rounding_constants import Slopes, first_form, slopes_of, with_rounding_constants
 from gsisio_jax.observer.types import Observer
@@ -166,9 +167,14 @@ def _check(
     sweeps: int,
     window: int,
 ) -> tuple[Interval | None, Interval]:
+    check_type("design_observer", "system", system, System)
+    check_type("design_observer", "noise", noise, Noise, "gx.Noise(w, v)")
     if form not in ("current", "prediction"):
         raise ValueError(f'design_observer: `form` must be "current" or "prediction", got {form!r}')
     system.check_unchanged("design_observer")
+    for name, count in (("gains", gains), ("sweeps", sweeps), ("window", window)):
+        if isinstance(count, bool) or not isinstance(count, int | np.integer):
+            raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1, got {count!r}")
     if gains < 1 or sweeps < 1:
         raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
     if window < 1 or (window > 1 and (form == "prediction" or system.periodic_states)):
@@ -181,9 +187,12 @@ def _check(
             raise ValueError(
                 f"design_observer: the noise bounds of `{name}` must have shape ({size},), got {box.shape}"
             )
-    if region != "auto" and (not isinstance(region, Interval) or region.shape != (system.n,)):
+    auto = isinstance(region, str) and region == "auto"
+    if not auto and (not isinstance(region, Interval) or region.shape != (system.n,)):
+        got = f"shape {region.shape}" if isinstance(region, Interval) else f"{type(region).__name__} {region!r}"
         raise ValueError(
-            f'design_observer: `region` must be an Interval of shape ({system.n},) or "auto", got {region!r}'
+            f'design_observer: `region` must be an Interval of shape ({system.n},) or "auto", got '
+            f"{got if len(got) < 200 else type(region).__name__}"
         )
     if u_region is None:
         if system.takes_u:
@@ -191,6 +200,7 @@ def _check(
                 "design_observer: f or g takes u; give `u_region`, the box of known inputs for which the design holds"
             )
         u_region = Interval(np.zeros(system.m), np.zeros(system.m))
+    check_type("design_observer", "u_region", u_region, Interval, f"gx.Interval(lower, upper) of shape ({system.m},)")
     if u_region.shape != (system.m,):
         raise ValueError(f"design_observer: `u_region` must have shape ({system.m},), got {u_region.shape}")
     return (region if isinstance(region, Interval) else None), u_region

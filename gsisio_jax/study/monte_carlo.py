@@ -11,10 +11,12 @@ import numpy as np
 
 from gsisio_jax._extras import need
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import read_array
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer import checks
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.estimation import OnConflict
+from gsisio_jax.plant.simulation import read_key
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.arguments import prepare
 from gsisio_jax.study.axes import RUN, Axis, Layout
@@ -117,7 +119,7 @@ def monte_carlo(
     check_confidence(CALL, confidence)
     system = observer.system
     numbers = _numbers(runs)
-    key = _key(key)
+    key = read_key(CALL, key)
     _check_steps(steps)
     if not callable(draw) and draw not in ("uniform", "vertices"):
         raise ValueError(f'{CALL}: `draw` must be "uniform", "vertices" or a function, got {draw!r}')
@@ -164,17 +166,6 @@ def _numbers(runs: int | Sequence[int]) -> np.ndarray:
     return numbers.astype(np.uint32)
 
 
-def _key(key: Any) -> Any:
-    if isinstance(key, int | np.integer):
-        return jax.random.key(int(key))
-    if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0:
-        return key
-    try:
-        return jax.random.wrap_key_data(jnp.asarray(key))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{CALL}: `key` must be one key of jax.random or an integer seed; got {key!r}") from error
-
-
 def _check_steps(steps: Any) -> None:
     if not isinstance(steps, int | np.integer) or steps < 1:
         raise ValueError(f"{CALL}: `steps` must be the number of measurements of a run, at least 1; got {steps!r}")
@@ -191,14 +182,14 @@ def _first_states(system: Any, x0: Any, draw: Any) -> tuple[Any, bool]:
                 f"{np.asarray(x0.width)}; for states from elsewhere give a function x0(key)"
             )
         return x0, False
-    point = np.asarray(x0, dtype=np.float64)
+    point = np.asarray(read_array(CALL, "x0", x0), dtype=np.float64)
     if point.shape != (system.n,) or not np.isfinite(point).all():
         raise ValueError(f"{CALL}: `x0` must be a box, a finite point ({system.n},) or a function of a key; got {x0!r}")
     return point, True
 
 
 def _input(d: Any, steps: int, size: int, dtype: Any) -> np.ndarray:
-    d = np.asarray(d, dtype)
+    d = np.asarray(read_array(CALL, "d", d), dtype)
     if d.shape != (steps, size) or not np.isfinite(d).all():
         raise ValueError(
             f"{CALL}: `d` must be a finite array ({steps}, {size}) or a function d(key, k, x), got shape {d.shape}"
