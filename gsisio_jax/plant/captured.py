@@ -118,6 +118,8 @@ def _foreign(value: Any) -> bool:
 
 
 def _fingerprint(value: Any) -> str:
+    if isinstance(value, jax.Array) and jax.dtypes.issubdtype(value.dtype, jax.dtypes.prng_key):
+        value = jax.random.key_data(value)
     array = np.asarray(value)
     digest = hashlib.blake2b(np.ascontiguousarray(array).tobytes(), digest_size=12).hexdigest()
     return f"{array.dtype}{array.shape}{digest}"

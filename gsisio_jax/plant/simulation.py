@@ -83,9 +83,8 @@ def read_key(call: str, key: Any) -> Any:
     try:
         return jax.random.wrap_key_data(jnp.asarray(key))
     except (TypeError, ValueError) as error:
-        got = (
-            f"an array of shape {key.shape}" if isinstance(key, jax.Array) else f"{type(key).__name__} {str(key)[:40]}"
-        )
+        shape = getattr(key, "shape", None)
+        got = f"{type(key).__name__} {str(key)[:40]}" if shape is None else f"an array of shape {shape}"
         raise ValueError(f"{call}: `key` must be one key of jax.random or an integer seed; got {got}") from error
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type, read_array
-from gsisio_jax.plant.calls import as_vector, check_map, hashable, takes_u
+from gsisio_jax.plant.calls import as_static, as_vector, check_map, hashable, takes_u
 from gsisio_jax.plant.captured import Captured, captured, changed
 from gsisio_jax.plant.periodic import Periods, check_feedthrough, check_states, read_periods, turns
 
@@ -82,7 +82,7 @@ class System(eqx.Module):
         periodic: Mapping[int, float] | None = None,
         periodic_states: Mapping[int, float] | None = None,
     ):
-        self.f, self.g = f, g
+        self.f, self.g = as_static(f), as_static(g)
         self.G, self.H = _matrix("G", G), _matrix("H", H)
         if self.G.shape[1] != self.H.shape[1]:
             raise ValueError(

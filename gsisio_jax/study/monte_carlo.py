@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax._extras import need
+from gsisio_jax.errors import ContainmentLost
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import read_array
 from gsisio_jax.interval.rounding import Rounding
@@ -19,7 +20,7 @@ from gsisio_jax.observer.estimation import OnConflict
 from gsisio_jax.plant.simulation import read_key
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.arguments import prepare
-from gsisio_jax.study.axes import RUN, Axis, Layout
+from gsisio_jax.study.axes import RUN, Axis, Layout, bare
 from gsisio_jax.study.containment import Containment, TrueRun
 from gsisio_jax.study.job import Job
 from gsisio_jax.study.labels import Labels
@@ -134,6 +135,8 @@ def monte_carlo(
         "u": u, "length": None, "truth": None,
     }  # fmt: skip
     prepared, dtype = prepare(CALL, system, given)
+    if on_miss == "raise" and start is not None:
+        _check_start(start, bare(prepared["initial"]), of_point)
     arguments = {name: prepared[name] for name in ("initial", "noise", "u")}
     if start is not None:
         start = jax.tree.map(lambda a: np.asarray(a, dtype), start)
@@ -186,6 +189,22 @@ def _first_states(system: Any, x0: Any, draw: Any) -> tuple[Any, bool]:
     if point.shape != (system.n,) or not np.isfinite(point).all():
         raise ValueError(f"{CALL}: `x0` must be a box, a finite point ({system.n},) or a function of a key; got {x0!r}")
     return point, True
+
+
+def _check_start(x0: Any, initial: Interval, of_point: bool) -> None:
+    """Refuse first states outside of the boxes that the observer is given before anything is compiled for them."""
+    lower, upper = (x0, x0) if of_point else (np.asarray(x0.lower), np.asarray(x0.upper))
+    # The boxes have been rounded outward where they are narrower, the states to nearest: within an ulp of each other.
+    kind = initial.lower.dtype
+    outside = (lower.astype(kind) < initial.lower) | (upper.astype(kind) > initial.upper)
+    if outside.any():
+        component = int(np.argwhere(outside)[0][-1])
+        low, high = (np.reshape(side, (-1, len(lower)))[:, component] for side in (initial.lower, initial.upper))
+        raise ContainmentLost(
+            f"{CALL}: `x0` of x{component + 1} is {lower[component]:g} to {upper[component]:g}, outside of the box "
+            f"`initial` of the observer, {low.max():g} to {high.min():g}, where the boxes promise nothing. Give a "
+            'larger `initial` (or on_miss="record" to count such runs)'
+        )
 
 
 def _input(d: Any, steps: int, size: int, dtype: Any) -> np.ndarray:
