@@ -12,7 +12,13 @@ import gsisio_jax
 PACKAGE = Path(gsisio_jax.__file__).parent
 # Everything `estimate`, `start` and `step` may run through.
 FOLDERS = ("inclusion", "interval", "observer", "plant")
-ONLINE = sorted([PACKAGE / "errors.py", *(path for name in FOLDERS for path in (PACKAGE / name).rglob("*.py"))])
+ONLINE = sorted(
+    [
+        PACKAGE / "errors.py",
+        PACKAGE / "tracing.py",
+        *(path for name in FOLDERS for path in (PACKAGE / name).rglob("*.py")),
+    ]
+)
 
 
 def _fresh(code: str) -> str:

@@ -71,8 +71,8 @@ class Bounds(Part):
             radius = ", ".join(f"{part:g}" for part in (value if isinstance(value, list) else [value])
                                if isinstance(part, int | float))  # fmt: skip
             raise ValueError(
-                f"must be a box, got {value!r}; write {{ radius = [{radius or '...'}] }}, one number for each component, "
-                "or { lower = [...], upper = [...] }"
+                f"must be a box, got {value!r}; write {{ radius = [{radius or '...'}] }}, one number for each "
+                "component, or { lower = [...], upper = [...] }"
             )
         return value
 

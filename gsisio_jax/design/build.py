@@ -122,7 +122,7 @@ def design_observer(
 
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
-    given, u_region = _check(system, noise, region, form, gains, u_region, sweeps, window)
+    given, u_region = _check(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS
     methods = check_methods("design_observer", default if bounds is None else bounds)
     if form == "prediction":
@@ -166,6 +166,8 @@ def _check(
     u_region: Interval | None,
     sweeps: int,
     window: int,
+    missing: Any,
+    certify: Any,
 ) -> tuple[Interval | None, Interval]:
     check_type("design_observer", "system", system, System)
     check_type("design_observer", "noise", noise, Noise, "gx.Noise(w, v)")
@@ -175,6 +177,9 @@ def _check(
     for name, count in (("gains", gains), ("sweeps", sweeps), ("window", window)):
         if isinstance(count, bool) or not isinstance(count, int | np.integer):
             raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1, got {count!r}")
+    for name, flag in (("missing", missing), ("certify", certify)):
+        if not isinstance(flag, bool | np.bool_):
+            raise ValueError(f"design_observer: `{name}` must be True or False, got {flag!r}")
     if gains < 1 or sweeps < 1:
         raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
     if window < 1 or (window > 1 and (form == "prediction" or system.periodic_states)):

@@ -20,7 +20,7 @@ from gsisio_jax.interval import rounding
 from gsisio_jax.interval.cast import cast_down, cast_towards, cast_up
 from gsisio_jax.interval.minmax import cut, larger, raised, smaller
 from gsisio_jax.interval.primitives import fusion_barrier
-from gsisio_jax.interval.reading import read_array
+from gsisio_jax.interval.reading import check_type, read_array
 
 
 def is_concrete(value: Any) -> bool:
@@ -91,6 +91,9 @@ class Interval(eqx.Module):
     @classmethod
     def entire(cls, shape: int | tuple[int, ...]) -> Interval:
         """All of R^shape: nothing is known."""
+        sizes = shape if isinstance(shape, tuple) else (shape,)
+        if not all(isinstance(size, int | np.integer) and size >= 0 for size in sizes):
+            raise ValueError(f"Interval.entire: `shape` must be a number of components, or a tuple; got {shape!r}")
         return cls(np.full(shape, -np.inf), np.full(shape, np.inf))
 
     @property
@@ -156,6 +159,8 @@ class Interval(eqx.Module):
 
     def astype(self, dtype: Any) -> Interval:
         """The smallest box of that floating type that contains this one (a narrowing cast rounds outward)."""
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(f"Interval.astype: bounds have a floating type (float64, float32), got {dtype}")
         lower = cast_down(self.lower, dtype)
         if self.lower is self.upper and self.lower.dtype == lower.dtype:  # known to be a point: that stays known
             return Interval.unchecked(*rounding.normal(lower, lower))
@@ -264,8 +269,18 @@ def choose(mask: Any, a: Interval, b: Interval) -> Interval:
     return Interval.unchecked(jnp.where(mask, a.lower, b.lower), jnp.where(mask, a.upper, b.upper))
 
 
+def _check_pair(call: str, a: Any, b: Any) -> None:
+    for name, box in (("a", a), ("b", b)):
+        check_type(call, name, box, Interval, "gx.Interval.point(x) is the box that holds one value")
+    try:
+        np.broadcast_shapes(a.shape, b.shape)
+    except ValueError:
+        raise ValueError(f"{call}: two boxes of the same shape are needed, got {a.shape} and {b.shape}") from None
+
+
 def hull(a: Interval, b: Interval) -> Interval:
     """The smallest box that contains both boxes, elementwise."""
+    _check_pair("hull", a, b)
     return Interval.unchecked(smaller(a.lower, b.lower), larger(a.upper, b.upper))
 
 
@@ -282,6 +297,7 @@ def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
         unchanged, so the result is never crossed: the caller must look at the slack. A side of b that is NaN (it
         overflowed) is passed over.
     """
+    _check_pair("intersect", a, b)
     slack = smaller(a.upper - b.lower, b.upper - a.lower)
     lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
     empty = upper < lower

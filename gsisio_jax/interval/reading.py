@@ -99,6 +99,8 @@ def _check_kind(value: Any) -> None:
         return
     if hasattr(value, "lower") and hasattr(value, "upper") and not isinstance(value, str | bytes):
         _refuse(f"an object of type {kind}", "arguments may be in the wrong order; a box has arrays .lower and .upper")
+    if type(value).__module__.startswith("gsisio_jax"):
+        _refuse(f"an object of type {kind}", "are the arguments in the right order?")
     if isinstance(value, Set) or callable(value) or hasattr(value, "__next__"):
         _refuse(f"an object of type {kind}")
     if hasattr(value, "toarray"):

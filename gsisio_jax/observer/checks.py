@@ -65,9 +65,9 @@ def prepare(
         )
     y = read_array(call, "y" if rows else "the measurement", y, missing=True)
     if y.ndim != 1 + rows or y.shape[-1] != system.l or (rows and y.shape[0] == 0 and call == "estimate"):
+        needed = f"(T, {system.l}) with T >= 1" if rows else f"({system.l},)"
         raise ValueError(
-            f"{call}: measurements must have shape {lead}{system.l}) with T >= 1, got {y.shape}; for many records use "
-            "jax.vmap"
+            f"{call}: measurements must have shape {needed}, got {y.shape}; {_hint(y.shape, system.l, rows)}"
         )
     if is_concrete(y) and np.isinf(np.asarray(y)).any():
         raise ValueError(f"{call}: a measurement is infinite; mark missing entries with NaN")
@@ -102,6 +102,15 @@ def prepare(
     noise = _with_lost(y, Noise.unchecked(w, v), dtype)
     y, u = (value if getattr(value, "dtype", None) == dtype else jnp.asarray(value, dtype) for value in (y, u))
     return initial, y, u, noise, observer
+
+
+def _hint(shape: tuple[int, ...], outputs: int, rows: bool) -> str:
+    """How measurements of that shape can be brought into the right one."""
+    if rows and len(shape) == 1 and outputs == 1:
+        return "y[:, None] has it"
+    if rows and len(shape) == 2 and shape[0] == outputs:
+        return "y.T has it"
+    return "for many records use jax.vmap" if rows else "give one row; for a record use gx.estimate"
 
 
 def _has_type(box: Interval, dtype: Any) -> bool:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax.plant.traced import check_trace
+from gsisio_jax.tracing import explanation
 
 _POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 _NONE = inspect.Parameter.empty
@@ -101,8 +102,7 @@ def check_map(name: str, function: Callable[..., Any], size: int, n: int, m: int
         first, second = (jax.make_jaxpr(lambda x, u: once(x, u))(x, u) for _ in range(2))
     except Exception as error:
         raise ValueError(
-            f"System: calling {name} with x of shape ({n},) and u of shape ({m},) failed: {_first_line(error)}."
-            f"{_remedy(error)}"
+            f"System: calling {name} with x of shape ({n},) and u of shape ({m},) failed: {explanation(error)}"
         ) from error
     out = found[0]
     if getattr(out, "shape", None) != (size,):
@@ -117,47 +117,6 @@ def check_map(name: str, function: Callable[..., Any], size: int, n: int, m: int
             "imaginary parts"
         )
     check_trace(name, first, second)
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().split("\n")[0].split(": https://")[0].rstrip(".") or type(error).__name__
-
-
-_REMEDIES = (
-    (
-        jax.errors.TracerArrayConversionError,
-        "Use jax.numpy in the place of numpy (jnp.sin, not np.sin): JAX has to follow what is computed",
-    ),
-    (
-        jax.errors.TracerBoolConversionError,
-        "Python's `if`, `while`, `and`, min() and max() cannot depend on x; use jnp.where, jnp.logical_and, "
-        "jnp.minimum, jax.lax.cond",
-    ),
-    (
-        (jax.errors.TracerIntegerConversionError, jax.errors.NonConcreteBooleanIndexError),
-        "An index, a size or a number of turns cannot depend on x; use jnp.where, jnp.interp or jnp.take",
-    ),
-    (
-        jax.errors.ConcretizationTypeError,
-        "float(x), int(x), x.item() and the functions of `math` cannot be followed by JAX; use jnp (jnp.sin, not "
-        "math.sin), and jnp.where in the place of `if`",
-    ),
-)
-_BY_WORDS = (
-    ("immutable", "Write x.at[0].set(value), or stack the entries: jnp.stack([...])"),
-    ("out of bounds", "x has one entry per row of G, u one per known input"),
-    ("shape", "x has one entry per row of G, u one per known input"),
-    ("to unpack", "x has one entry per row of G, u one per known input"),
-    ("can be converted to Python scalars", "Use jnp (jnp.sin, not math.sin)"),
-)
-
-
-def _remedy(error: Exception) -> str:
-    for kinds, remedy in _REMEDIES:
-        if isinstance(error, kinds):
-            return f" {remedy}"
-    found = (remedy for words, remedy in _BY_WORDS if words in str(error))
-    return "".join(f" {remedy}" for remedy in [next(found, None)] if remedy)
 
 
 class Unhashable:

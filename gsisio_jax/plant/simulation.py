@@ -49,6 +49,10 @@ def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = N
     check_type("simulate", "noise", noise, Noise, "gx.Noise(w, v)")
     system.check_unchanged("simulate")
     key = read_key("simulate", key)
+    if d is None:
+        raise ValueError(
+            f"simulate: give the unknown input `d`, shape (T, {system.p}); np.zeros((T, {system.p})) is none"
+        )
     x0, d = _floating("x0", x0), _floating("d", d)
     if d.ndim != 2 or d.shape[1] != system.p:
         raise ValueError(f"simulate: `d` must have shape (T, {system.p}), got {d.shape}")

@@ -29,6 +29,7 @@ from gsisio_jax.study.reductions import resolve
 from gsisio_jax.study.run import run
 from gsisio_jax.study.summary import check_confidence, summary
 from gsisio_jax.study.truth import Coverage
+from gsisio_jax.tracing import explanation
 
 CALL = "monte_carlo"
 # Dimensions of every argument of one case.
@@ -234,7 +235,7 @@ def _check_functions(system: Any, key: Any, arguments: Any, dtype: Any, x0: Any,
             shapes = [np.shape(leaf) for leaf in jax.tree.leaves(jax.eval_shape(function, *given))]
         except Exception as error:
             raise ValueError(
-                f"{CALL}: {name} must be a function that JAX can trace and return {expected}. {error}"
+                f"{CALL}: {name} must be a function that JAX can trace and return {expected}. {explanation(error)}"
             ) from error
         if shapes != [(size,) for size in sizes]:
             raise ValueError(f"{CALL}: {name} must return {expected}, got {' and '.join(map(str, shapes))}")

@@ -25,7 +25,7 @@ from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.reading import read_array
+from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.observer.rounding_constants import slopes_of
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise, System
@@ -102,6 +102,8 @@ def allocate(
 
     Source: theory 4 and 6.
     """
+    check_type("allocate", "system", system, System)
+    check_type("allocate", "noise", noise, Noise, "gx.Noise(w, v)")
     if not isinstance(region, Interval) or region.shape != (system.n,):
         raise ValueError(f"allocate: `region` must be an Interval of shape ({system.n},), got {region!r}")
     required = np.asarray(read_array("allocate", "required", required), float)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsisio_jax.interval.reading import read_array
+from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.tuning import search as searching
@@ -176,6 +176,7 @@ def _start(shape: Shape, start: TunedNoise | Noise | None) -> np.ndarray:
     if start is None:
         return np.ones(len(shape.names))
     noise = start.noise if isinstance(start, TunedNoise) else start
+    check_type("tune_noise", "start", noise, (Noise, TunedNoise), "give earlier bounds, or leave it out")
     factors = shape.factors(noise)
     if not (np.isfinite(factors).all() and factors.any()):
         raise ValueError(f"tune_noise: `start` gives no bounds to start from, factors {factors.tolist()}")
