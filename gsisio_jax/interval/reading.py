@@ -97,8 +97,6 @@ def _check_kind(value: Any) -> None:
         )
     if hasattr(value, "to_numpy"):  # whose columns may have any names
         return
-    if hasattr(value, "lower") and hasattr(value, "upper") and not isinstance(value, str | bytes):
-        _refuse(f"an object of type {kind}", "arguments may be in the wrong order; a box has arrays .lower and .upper")
     if type(value).__module__.startswith("gsisio_jax"):
         _refuse(f"an object of type {kind}", "are the arguments in the right order?")
     if isinstance(value, Set) or callable(value) or hasattr(value, "__next__"):
@@ -113,7 +111,7 @@ def _of_jax(value: jax.Array) -> Any:
     if jnp.issubdtype(value.dtype, jnp.floating):
         return value
     if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-        _refuse("a random key", "arguments may be in the wrong order")
+        _refuse("a random key", "are the arguments in the right order?")
     if jnp.issubdtype(value.dtype, jnp.complexfloating):
         _refuse_complex()
     return value.astype(jnp.result_type(float))
