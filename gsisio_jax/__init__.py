@@ -85,6 +85,11 @@ _LAZY = {
 }
 
 
+def __dir__() -> list[str]:
+    """The public names, those that are loaded on first use among them."""
+    return sorted(__all__)
+
+
 def __getattr__(name: str) -> Any:
     """Load on first use what an online run does not need: the solver, studies, tables and pictures."""
     if name not in _LAZY:

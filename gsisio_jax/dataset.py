@@ -13,6 +13,7 @@ import numpy as np
 
 from gsisio_jax._extras import need
 from gsisio_jax._version import __version__
+from gsisio_jax.interval.reading import read_array
 from gsisio_jax.observer.status import flag_attributes
 
 
@@ -53,6 +54,8 @@ def to_dataset(
         MissingExtra: xarray is not installed.
     """
     xarray = need("xarray", extra="cli", purpose="a labelled dataset")
+    if not hasattr(est, "state"):
+        raise ValueError(f"to_dataset: `est` must be what gx.estimate returns, got {type(est).__name__}")
     state_shape = np.shape(est.state.lower)
     if len(state_shape) != 2:
         raise ValueError(
@@ -73,7 +76,7 @@ def to_dataset(
     for index, (name, unit) in enumerate(zip(input_names, input_units, strict=True)):
         _add_bounds(variables, name, unit, "unknown input", lower, upper, index)
     if y is not None:
-        y = np.asarray(y)
+        y = np.asarray(read_array("to_dataset", "y", y, missing=True))
         if y.ndim != 2 or len(y) != steps:
             raise ValueError(f"to_dataset: `y` must have shape ({steps}, l), got {y.shape}")
         output_names, output_units = _labels("output", output_names, output_units, y.shape[1], "y")
@@ -132,7 +135,7 @@ def alarm_records(est: Any, time: Any, **labels: Any) -> list[dict[str, Any]]:
 def _time(time: Any, steps: int) -> tuple[np.ndarray, dict[str, str]]:
     if time is None:
         return np.arange(steps, dtype=np.float64), {"long_name": "step"}
-    time = np.asarray(time, dtype=np.float64)
+    time = np.asarray(read_array("to_dataset", "time", time), dtype=np.float64)
     if time.shape != (steps,):
         raise ValueError(f"to_dataset: `time` must have shape ({steps},), got {time.shape}")
     return time, {"units": "s", "long_name": "time"}

@@ -12,7 +12,8 @@ import gsisio_jax
 PACKAGE = Path(gsisio_jax.__file__).parent
 # Everything `estimate`, `start` and `step` may run through.
 FOLDERS = ("inclusion", "interval", "observer", "plant")
-ONLINE = sorted([PACKAGE / "errors.py", *(path for name in FOLDERS for path in (PACKAGE / name).rglob("*.py"))])
+FILES = (PACKAGE / "errors.py", PACKAGE / "tracing.py")
+ONLINE = sorted([*FILES, *(path for name in FOLDERS for path in (PACKAGE / name).rglob("*.py"))])
 
 
 def _fresh(code: str) -> str:
@@ -31,6 +32,11 @@ def test_import_brings_no_scipy_of_its_own():
     """JAX may import SciPy or not; the package adds nothing to it."""
     code = "import sys, jax, jax.numpy, equinox, jaxtyping; before = set(sys.modules); import gsisio_jax; "
     assert _fresh(code + "print(sorted(m for m in set(sys.modules) - before if m.startswith('scipy')))") == "[]"
+
+
+def test_the_listed_names_are_the_public_ones():
+    assert dir(gsisio_jax) == sorted(gsisio_jax.__all__)
+    assert all(hasattr(gsisio_jax, name) for name in dir(gsisio_jax))
 
 
 def test_import_changes_no_configuration():

@@ -140,12 +140,14 @@ def read_config(path: Path) -> Config:
 def _one_line(error: ValidationError) -> str:
     """The first problem as ``key: what is wrong``, and how many more there are."""
     problems = error.errors()
-    first = problems[0]
+    # What is misspelled is why something else is missing.
+    first = next((one for one in problems if one["type"] == "extra_forbidden"), problems[0])
     key, kind = _dotted(first["loc"]), first["type"]
     if kind == "missing":
         text = f"{key} is missing"
     elif kind == "extra_forbidden":
-        text = f"unknown key {key}{_did_you_mean(first['loc'])}"
+        kind = "section" if isinstance(first["input"], dict) else "key"
+        text = f"unknown {kind} {key}{_did_you_mean(first['loc'])}"
     elif kind == "value_error":
         text = f"{key}: {first.get('ctx', {}).get('error', first['msg'])}"
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
 
@@ -63,6 +63,18 @@ class Bounds(Part):
     radius: list[Number] | None = None
     lower: list[Number] | None = None
     upper: list[Number] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_table(cls, value: Any) -> Any:
+        if isinstance(value, int | float | str | list):
+            radius = ", ".join(f"{part:g}" for part in (value if isinstance(value, list) else [value])
+                               if isinstance(part, int | float))  # fmt: skip
+            raise ValueError(
+                f"must be a box, got {value!r}; write {{ radius = [{radius or '...'}] }}, one number for each "
+                "component, or { lower = [...], upper = [...] }"
+            )
+        return value
 
     @model_validator(mode="after")
     def _check(self) -> Bounds:

@@ -30,6 +30,7 @@ from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.rounding_constants import Slopes, first_form, slopes_of, with_rounding_constants
 from gsisio_jax.observer.types import Observer
@@ -129,7 +130,7 @@ def design_observer(
 
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
-    given, u_region = _check(system, noise, region, form, gains, u_region, sweeps, window)
+    given, u_region = _check(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS
     methods = check_methods("design_observer", default if bounds is None else bounds)
     if form == "prediction":
@@ -173,13 +174,24 @@ def _check(
     u_region: Interval | None,
     sweeps: int,
     window: int | str,
+    missing: Any,
+    certify: Any,
 ) -> tuple[Interval | None, Interval]:
+    check_type("design_observer", "system", system, System)
+    check_type("design_observer", "noise", noise, Noise, "gx.Noise(w, v)")
     if form not in ("current", "prediction"):
         raise ValueError(f'design_observer: `form` must be "current" or "prediction", got {form!r}')
     system.check_unchanged("design_observer")
+    for name, count in (("gains", gains), ("sweeps", sweeps)):
+        if isinstance(count, bool) or not isinstance(count, int | np.integer):
+            raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1, got {count!r}")
+    for name, flag in (("missing", missing), ("certify", certify)):
+        if not isinstance(flag, bool | np.bool_):
+            raise ValueError(f"design_observer: `{name}` must be True or False, got {flag!r}")
     if gains < 1 or sweeps < 1:
         raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
-    if window != "auto" and (not isinstance(window, int | np.integer) or window < 1):
+    steps = window if isinstance(window, int | np.integer) and not isinstance(window, bool) else 0
+    if window != "auto" and steps < 1:
         raise ValueError(
             f'design_observer: `window` must be a whole number of steps, at least 1, or "auto", got {window!r}'
         )
@@ -193,9 +205,12 @@ def _check(
             raise ValueError(
                 f"design_observer: the noise bounds of `{name}` must have shape ({size},), got {box.shape}"
             )
-    if region != "auto" and (not isinstance(region, Interval) or region.shape != (system.n,)):
+    auto = isinstance(region, str) and region == "auto"
+    if not auto and (not isinstance(region, Interval) or region.shape != (system.n,)):
+        got = f"shape {region.shape}" if isinstance(region, Interval) else f"{type(region).__name__} {region!r}"
         raise ValueError(
-            f'design_observer: `region` must be an Interval of shape ({system.n},) or "auto", got {region!r}'
+            f'design_observer: `region` must be an Interval of shape ({system.n},) or "auto", got '
+            f"{got if len(got) < 200 else type(region).__name__}"
         )
     if u_region is None:
         if system.takes_u:
@@ -203,6 +218,7 @@ def _check(
                 "design_observer: f or g takes u; give `u_region`, the box of known inputs for which the design holds"
             )
         u_region = Interval(np.zeros(system.m), np.zeros(system.m))
+    check_type("design_observer", "u_region", u_region, Interval, f"gx.Interval(lower, upper) of shape ({system.m},)")
     if u_region.shape != (system.m,):
         raise ValueError(f"design_observer: `u_region` must have shape ({system.m},), got {u_region.shape}")
     return (region if isinstance(region, Interval) else None), u_region

@@ -17,6 +17,7 @@ from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node,
 from gsisio_jax.interval.box import Interval, choose
 from gsisio_jax.interval.primitives import add_up
 from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
+from gsisio_jax.tracing import explained
 
 
 class AffineForm(eqx.Module):
@@ -185,7 +186,10 @@ def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable
 
     values = jax.tree.map(convert, args, is_leaf=is_box)
     shapes = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), values, is_leaf=is_node)
-    closed, out = jax.make_jaxpr(f, return_shape=True)(jax.ShapeDtypeStruct(x.shape, x.dtype), *shapes)
+    if not callable(f):
+        raise ValueError(f"inclusion: bounds are of a function of x, got {type(f).__name__}")
+    with explained(f"inclusion: calling the function with x of shape {x.shape}"):
+        closed, out = jax.make_jaxpr(f, return_shape=True)(jax.ShapeDtypeStruct(x.shape, x.dtype), *shapes)
     inputs = [x, *jax.tree.leaves(values, is_leaf=is_node)]
     results = evaluate(closed.jaxpr, closed.consts, inputs)
     nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]

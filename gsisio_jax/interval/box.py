@@ -20,23 +20,12 @@ from gsisio_jax.interval import rounding
 from gsisio_jax.interval.cast import cast_down, cast_towards, cast_up
 from gsisio_jax.interval.minmax import cut, larger, raised, smaller
 from gsisio_jax.interval.primitives import fusion_barrier
+from gsisio_jax.interval.reading import check_type, read_array
 
 
 def is_concrete(value: Any) -> bool:
     """True where the numbers of an array can be looked at (no tracer)."""
     return not isinstance(value, Tracer)
-
-
-def _as_float_array(value: Any, call: str, name: str) -> Any:
-    """Keep JAX floating arrays; turn everything else into a float64 NumPy array, so that nothing is rounded here."""
-    if isinstance(value, (jax.Array, np.ndarray)) and jnp.issubdtype(value.dtype, jnp.floating):
-        return value
-    if isinstance(value, jax.Array):
-        return value.astype(jnp.result_type(float))
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{call}: `{name}` must be an array of real numbers, got {value!r}") from error
 
 
 class Interval(eqx.Module):
@@ -64,8 +53,8 @@ class Interval(eqx.Module):
     upper: Any
 
     def __init__(self, lower: Any, upper: Any):
-        lower = _as_float_array(lower, "Interval", "lower")
-        upper = _as_float_array(upper, "Interval", "upper")
+        lower = read_array("Interval", "lower", lower)
+        upper = read_array("Interval", "upper", upper)
         if lower.shape != upper.shape:
             try:
                 shape = np.broadcast_shapes(lower.shape, upper.shape)
@@ -96,12 +85,15 @@ class Interval(eqx.Module):
     @classmethod
     def symmetric(cls, radius: Any) -> Interval:
         """The box ``[-radius, radius]``."""
-        radius = _as_float_array(radius, "Interval.symmetric", "radius")
+        radius = read_array("Interval.symmetric", "radius", radius)
         return cls(-radius, radius)
 
     @classmethod
     def entire(cls, shape: int | tuple[int, ...]) -> Interval:
         """All of R^shape: nothing is known."""
+        sizes = shape if isinstance(shape, tuple) else (shape,)
+        if not all(isinstance(size, int | np.integer) and size >= 0 for size in sizes):
+            raise ValueError(f"Interval.entire: `shape` must be a number of components, or a tuple; got {shape!r}")
         return cls(np.full(shape, -np.inf), np.full(shape, np.inf))
 
     @property
@@ -136,14 +128,39 @@ class Interval(eqx.Module):
         return Interval.unchecked(self.lower[index], self.upper[index])
 
     def __len__(self) -> int:
+        if not self.shape:
+            raise TypeError("Interval: a box of shape () has no length; it is one number, .lower to .upper")
         return len(self.lower)
 
+    def __iter__(self) -> Any:
+        raise TypeError(
+            "Interval: a box cannot be unpacked or looped over (would that be its sides, or its components?). Its "
+            "sides are box.lower and box.upper, component i is box[i]"
+        )
+
+    def __contains__(self, value: Any) -> bool:
+        raise TypeError("Interval: `x in box` would not say of which components; use box.contains(x), then .all()")
+
     def contains(self, value: Any, margin: float = 0.0) -> Any:
-        """Elementwise: is ``value`` inside, with `margin` to spare?"""
+        """Elementwise: is ``value`` inside, with `margin` to spare?
+
+        Args:
+            value: of the shape of the box or a scalar; with more axes in front, many values for one box, and the
+                other way round. NaN is not inside.
+            margin: in the unit of the box.
+
+        Raises:
+            ValueError: the shapes do not fit.
+        """
+        if type(value) is not np.ndarray:
+            value = read_array("Interval.contains", "value", value, missing=True)
+        _check_fits(self.shape, value.shape)
         return (self.lower + margin <= value) & (value <= self.upper - margin)
 
     def astype(self, dtype: Any) -> Interval:
         """The smallest box of that floating type that contains this one (a narrowing cast rounds outward)."""
+        if not jnp.issubdtype(dtype, jnp.floating):
+            raise ValueError(f"Interval.astype: bounds have a floating type (float64, float32), got {dtype}")
         lower = cast_down(self.lower, dtype)
         if self.lower is self.upper and self.lower.dtype == lower.dtype:  # known to be a point: that stays known
             return Interval.unchecked(*rounding.normal(lower, lower))
@@ -154,6 +171,18 @@ class Interval(eqx.Module):
         if is_concrete(self.lower) and is_concrete(self.upper):
             return f"Interval({np.asarray(self.lower)}, {np.asarray(self.upper)})"
         return f"Interval({self.lower}, {self.upper})"
+
+
+def _check_fits(box: tuple[int, ...], value: tuple[int, ...]) -> None:
+    """Shapes whose last axes agree. NumPy's rules would also pair (T, 1) with (T,), every number with every other."""
+    shared = min(len(box), len(value))
+    ends = list(zip(box[len(box) - shared :], value[len(value) - shared :], strict=True))
+    stretched = len(box) == len(value)  # axes of size 1, written by hand
+    if any(a != b and not (stretched and 1 in (a, b)) for a, b in ends[:-1]) or any(a != b for a, b in ends[-1:]):
+        raise ValueError(
+            f"Interval.contains: `value` of shape {value} does not fit the box of shape {box}; give one number for "
+            f"each side, shape {box}" + (f", or {('...', *box)} for many".replace("'...'", "...") if box else "")
+        )
 
 
 def _namespace(*values: Any) -> Any:
@@ -240,8 +269,18 @@ def choose(mask: Any, a: Interval, b: Interval) -> Interval:
     return Interval.unchecked(jnp.where(mask, a.lower, b.lower), jnp.where(mask, a.upper, b.upper))
 
 
+def _check_pair(call: str, a: Any, b: Any) -> None:
+    for name, box in (("a", a), ("b", b)):
+        check_type(call, name, box, Interval, "gx.Interval.point(x) is the box that holds one value")
+    try:
+        np.broadcast_shapes(a.shape, b.shape)
+    except ValueError:
+        raise ValueError(f"{call}: two boxes of the same shape are needed, got {a.shape} and {b.shape}") from None
+
+
 def hull(a: Interval, b: Interval) -> Interval:
     """The smallest box that contains both boxes, elementwise."""
+    _check_pair("hull", a, b)
     return Interval.unchecked(smaller(a.lower, b.lower), larger(a.upper, b.upper))
 
 
@@ -258,6 +297,7 @@ def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
         unchanged, so the result is never crossed: the caller must look at the slack. A side of b that is NaN (it
         overflowed) is passed over.
     """
+    _check_pair("intersect", a, b)
     slack = smaller(a.upper - b.lower, b.upper - a.lower)
     lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
     empty = upper < lower

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, nan_to_unbounded
 from gsisio_jax.interval.primitives import add_up, scale
+from gsisio_jax.interval.reading import read_array
 
 
 def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
@@ -32,6 +33,9 @@ def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
 
     Source: paper, Prop. 2 and Lemma 1.
     """
+    if not isinstance(x, Interval):
+        raise ValueError(f"linear_image: `x` must be a gsisio_jax.Interval of shape (n,), got {type(x).__name__}")
+    matrix = read_array("linear_image", "matrix", matrix)
     if np.ndim(matrix) != 2 or len(x.shape) != 1 or matrix.shape[1] != x.shape[0]:
         raise ValueError(
             f"linear_image: a matrix (m, n) and a box (n,) are needed, got {np.shape(matrix)} and {x.shape}"

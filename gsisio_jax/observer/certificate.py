@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.plant.system import Noise
 
 
@@ -92,6 +93,10 @@ class Certificate(eqx.Module):
 
     def noise_width(self, noise: Noise) -> Any:
         """What one step adds to the width, b of theory 4.1, (n,) or (T, n)."""
+        check_type("Certificate", "noise", noise, Noise, "gx.Noise(w, v)")
+        for name, box, size in (("w", noise.w, self.noise_w.shape[1]), ("v", noise.v, self.noise_v.shape[1])):
+            if box.shape[-1:] != (size,):
+                raise ValueError(f"Certificate: the bounds of `{name}` must have shape ({size},), got {box.shape}")
         return noise.w.width @ self.noise_w.T + noise.v.width @ self.noise_v.T + self.noise_fixed
 
     def next_width(self, width: Any, noise: Noise) -> Any:

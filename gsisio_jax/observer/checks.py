@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval, add, is_concrete
+from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.interval.rounding import Rounding, check_rounding
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.types import Observer
@@ -26,6 +27,7 @@ def check_on_conflict(call: str, on_conflict: str) -> bool:
 
 def rounded(call: str, observer: AnyObserver, rounding: Rounding | None) -> AnyObserver:
     """The observer with the rounding that a call asks for."""
+    check_type(call, "observer", observer, (Observer, PredictionObserver), "it is what gx.design_observer returns")
     if rounding is None:
         return observer
     check_rounding(call, rounding)
@@ -55,17 +57,17 @@ def prepare(
     if call != "step":  # which is called many times, and was checked by `start`
         system.check_unchanged(call)
     lead = "(T, " if rows else "("
-    if not (isinstance(y, jax.Array | np.ndarray) and jnp.issubdtype(y.dtype, jnp.floating)):
-        y = np.asarray(y, dtype=np.float64) if not isinstance(y, jax.Array) else y.astype(float)
-    if not isinstance(initial, Interval) or initial.shape != (system.n,):
+    check_type(call, "initial", initial, Interval, f"gx.Interval(lower, upper) of shape ({system.n},)")
+    if initial.shape != (system.n,):
         raise ValueError(
-            f"{call}: `initial` must be an Interval of shape ({system.n},), got {getattr(initial, 'shape', initial)}; "
-            "for many boxes use jax.vmap"
-        )
-    if y.ndim != 1 + rows or y.shape[-1] != system.l or (rows and y.shape[0] == 0 and call == "estimate"):
-        raise ValueError(
-            f"{call}: measurements must have shape {lead}{system.l}) with T >= 1, got {y.shape}; for many records use "
+            f"{call}: `initial` must be an Interval of shape ({system.n},), got {initial.shape}; for many boxes use "
             "jax.vmap"
+        )
+    y = read_array(call, "y" if rows else "the measurement", y, missing=True)
+    if y.ndim != 1 + rows or y.shape[-1] != system.l or (rows and y.shape[0] == 0 and call == "estimate"):
+        needed = f"(T, {system.l}) with T >= 1" if rows else f"({system.l},)"
+        raise ValueError(
+            f"{call}: measurements must have shape {needed}, got {y.shape}; {_hint(y.shape, system.l, rows)}"
         )
     if is_concrete(y) and np.isinf(np.asarray(y)).any():
         raise ValueError(f"{call}: a measurement is infinite; mark missing entries with NaN")
@@ -78,6 +80,7 @@ def prepare(
         if system.m > 0:
             raise ValueError(f"{call}: the system has {system.m} known inputs; give `u` of shape {lead}{system.m})")
         u = np.zeros((*y.shape[:-1], 0))
+    u = read_array(call, "u", u)
     if np.shape(u) != (*y.shape[:-1], system.m):
         raise ValueError(
             f"{call}: `u` must have shape {(*y.shape[:-1], system.m)}, one row per measurement, got {np.shape(u)}"
@@ -85,6 +88,7 @@ def prepare(
     if is_concrete(u) and not np.isfinite(np.asarray(u)).all():
         raise ValueError(f"{call}: `u` must be finite in every row; a known input cannot be missing")
     noise = observer.noise if noise is None else noise
+    check_type(call, "noise", noise, Noise, "gx.Noise(w, v)")
     for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
         legal = [(size,), (y.shape[0], size)] if rows else [(size,)]
         if box.shape not in legal:
@@ -98,6 +102,15 @@ def prepare(
     noise = _with_lost(y, Noise.unchecked(w, v), dtype)
     y, u = (value if getattr(value, "dtype", None) == dtype else jnp.asarray(value, dtype) for value in (y, u))
     return initial, y, u, noise, observer
+
+
+def _hint(shape: tuple[int, ...], outputs: int, rows: bool) -> str:
+    """How measurements of that shape can be brought into the right one."""
+    if rows and len(shape) == 1 and outputs == 1:
+        return "y[:, None] has it"
+    if rows and len(shape) == 2 and shape[0] == outputs:
+        return "y.T has it"
+    return "for many records use jax.vmap" if rows else "give one row; for a record use gx.estimate"
 
 
 def _has_type(box: Interval, dtype: Any) -> bool:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from gsisio_jax import scalar
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.alarms import Alarm, read_alarms
 from gsisio_jax.observer.checks import AnyObserver, check_length, check_on_conflict, normal, prepare
@@ -156,6 +157,7 @@ def step(
 
     Source: theory 11.
     """
+    check_type("step", "carry", carry, Carry, "it comes from gx.start, and then from every gx.step")
     box, y_k, u_k, noise, observer = prepare("step", observer, carry.state, y_k, u_k, noise, False, rounding)
     return _step(*fixed(observer), _as(carry, box.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))
 
@@ -174,6 +176,7 @@ def resume(
     Returns:
         The carry after the last row, and a `StepOutput` whose arrays have one row per row of `y`.
     """
+    check_type("resume", "carry", carry, Carry, "it comes from gx.start, and then from every gx.step")
     box, y, u, noise, observer = prepare("resume", observer, carry.state, y, u, noise, True, rounding)
     return _resume(*fixed(observer), _as(carry, box.dtype), y, u, noise, check_on_conflict("resume", on_conflict))
 

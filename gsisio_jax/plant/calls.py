@@ -10,6 +10,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from gsisio_jax.plant.traced import check_trace
+from gsisio_jax.tracing import explanation
+
 _POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 _NONE = inspect.Parameter.empty
 
@@ -96,11 +99,10 @@ def check_map(name: str, function: Callable[..., Any], size: int, n: int, m: int
         found.append(function(x, u))
 
     try:
-        jax.eval_shape(once, x, u)
+        first, second = (jax.make_jaxpr(lambda x, u: once(x, u))(x, u) for _ in range(2))
     except Exception as error:
         raise ValueError(
-            f"System: calling {name} with x of shape ({n},) and u of shape ({m},) failed: {_first_line(error)}"
-            f"{_remedy(error)}"
+            f"System: calling {name} with x of shape ({n},) and u of shape ({m},) failed: {explanation(error)}"
         ) from error
     out = found[0]
     if getattr(out, "shape", None) != (size,):
@@ -114,18 +116,37 @@ def check_map(name: str, function: Callable[..., Any], size: int, n: int, m: int
             f"System: {name} must return real numbers, it returns {out.dtype}; write complex states as their real and "
             "imaginary parts"
         )
+    check_trace(name, first, second)
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).strip().split("\n")[0] or type(error).__name__
+class Unhashable:
+    """A callable that has no hash, or is a pytree of arrays (an Equinox module), as a static part of a `System`: equal
+    to itself alone. Its numbers are watched as those of every map (`captured`)."""
+
+    def __init__(self, function: Callable[..., Any]):
+        self.__wrapped__ = function
+
+    def __call__(self, *args: Any) -> Any:
+        return self.__wrapped__(*args)
+
+    def __hash__(self) -> int:
+        return id(self.__wrapped__)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Unhashable) and self.__wrapped__ is other.__wrapped__
+
+    def __repr__(self) -> str:
+        return repr(self.__wrapped__)
 
 
-def _remedy(error: Exception) -> str:
-    if isinstance(error, jax.errors.TracerArrayConversionError):
-        return ". Use jax.numpy in the place of numpy (jnp.sin, not np.sin): JAX has to follow what is computed"
-    if isinstance(error, jax.errors.TracerBoolConversionError | jax.errors.ConcretizationTypeError):
-        return ". Python's `if`, `and` and float() cannot depend on x; use jnp.where, jnp.logical_and, jax.lax.cond"
-    return ""
+def as_static(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The map itself, or in `Unhashable` where it cannot be compared."""
+    try:
+        hash(function)
+    except TypeError:
+        return Unhashable(function)
+    arrays = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(function))
+    return Unhashable(function) if arrays else function
 
 
 class hashable:

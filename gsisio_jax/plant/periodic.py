@@ -12,6 +12,7 @@ import numpy as np
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 Periods = tuple[tuple[int, float], ...]
@@ -173,11 +174,22 @@ def wrapped(system: Any, boxes: Any) -> Interval:
     >>> wrapped(course, Interval([[355.0]], [[375.0]])).center.round(3).tolist()
     [[5.0]]
     """
-    system, boxes = getattr(system, "system", system), getattr(boxes, "state", boxes)
+    system, boxes = _plant_and_boxes("wrapped", system, boxes)
     if not system.periodic_states:
         return boxes
     period = columns(system.periodic_states, system.n)
     return moved_by(boxes, -jnp.round(boxes.center / period), period)
+
+
+def _plant_and_boxes(call: str, system: Any, boxes: Any) -> tuple[Any, Interval]:
+    """The plant of an observer, the boxes of an estimate."""
+    system, boxes = getattr(system, "system", system), getattr(boxes, "state", boxes)
+    if not hasattr(system, "periodic_states"):
+        raise ValueError(f"{call}: `system` must be a System or an observer, got {type(system).__name__}")
+    check_type(call, "boxes", boxes, Interval, "or an Estimate")
+    if boxes.shape[-1:] != (system.n,):
+        raise ValueError(f"{call}: `boxes` must have shape (..., {system.n}), got {boxes.shape}")
+    return system, boxes
 
 
 def moved_by(boxes: Interval, count: Any, period: np.ndarray) -> Interval:
@@ -206,7 +218,11 @@ def nearest(system: Any, x: Any, boxes: Interval) -> Any:
         x: states (..., n), or None.
         boxes: state boxes (..., n), or an `Estimate`.
     """
-    system, boxes = getattr(system, "system", system), getattr(boxes, "state", boxes)
+    system, boxes = _plant_and_boxes("nearest", system, boxes)
+    if x is not None:
+        x = read_array("nearest", "x", x, missing=True)
+        if np.shape(x)[-1:] != (system.n,):
+            raise ValueError(f"nearest: `x` must have shape (..., {system.n}), got {np.shape(x)}")
     if x is None or not system.periodic_states:
         return x
     period = columns(system.periodic_states, system.n)

@@ -6,9 +6,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.plant.periodic import wrapped_outputs
 from gsisio_jax.plant.system import Noise, System
 
@@ -27,7 +29,7 @@ def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = N
 
     Args:
         system: the plant.
-        key: a key of `jax.random`.
+        key: a key of `jax.random`, or an integer seed.
         x0: first state, shape (n,).
         d: unknown input, shape (T, p).
         noise: bounds of w and v.
@@ -39,12 +41,19 @@ def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = N
         to between minus and plus half a period; states are not.
 
     Raises:
-        ValueError: shapes do not agree.
+        ValueError: shapes do not agree, or a number is not finite.
 
     Source: paper, (eq:system); theory 11.
     """
+    check_type("simulate", "system", system, System)
+    check_type("simulate", "noise", noise, Noise, "gx.Noise(w, v)")
     system.check_unchanged("simulate")
-    x0, d = jnp.asarray(x0, float), jnp.asarray(d, float)
+    key = read_key("simulate", key)
+    if d is None:
+        raise ValueError(
+            f"simulate: give the unknown input `d`, shape (T, {system.p}); np.zeros((T, {system.p})) is none"
+        )
+    x0, d = _floating("x0", x0), _floating("d", d)
     if d.ndim != 2 or d.shape[1] != system.p:
         raise ValueError(f"simulate: `d` must have shape (T, {system.p}), got {d.shape}")
     if x0.shape != (system.n,):
@@ -53,10 +62,41 @@ def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = N
         if system.m > 0:
             raise ValueError(f"simulate: the system has {system.m} known inputs; give `u` of shape (T, {system.m})")
         u = jnp.zeros((d.shape[0], 0))
-    u = jnp.asarray(u, float)
+    u = _floating("u", u)
     if u.shape != (d.shape[0], system.m):
         raise ValueError(f"simulate: `u` must have shape ({d.shape[0]}, {system.m}), got {u.shape}")
+    for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
+        if box.shape not in ((size,), (d.shape[0], size)):
+            raise ValueError(
+                f"simulate: the noise bounds of `{name}` must have shape ({size},) or ({d.shape[0]}, {size}), got "
+                f"{box.shape}"
+            )
     return _simulate(system, key, x0, d, noise.astype(x0.dtype), u)
+
+
+def read_key(call: str, key: Any) -> Any:
+    """One key of `jax.random`, which an integer seed makes, too.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    if isinstance(key, int | np.integer) and not isinstance(key, bool):
+        return jax.random.key(int(key))
+    if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0:
+        return key
+    try:
+        return jax.random.wrap_key_data(jnp.asarray(key))
+    except (TypeError, ValueError) as error:
+        shape = getattr(key, "shape", None)
+        got = f"{type(key).__name__} {str(key)[:40]}" if shape is None else f"an array of shape {shape}"
+        raise ValueError(f"{call}: `key` must be one key of jax.random or an integer seed; got {got}") from error
+
+
+def _floating(name: str, value: Any) -> Any:
+    array = jnp.asarray(read_array("simulate", name, value), float)
+    if is_concrete(array) and not np.isfinite(np.asarray(array)).all():
+        raise ValueError(f"simulate: `{name}` must be finite everywhere; a simulation has no missing numbers")
+    return array
 
 
 @jax.jit

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval, is_concrete
-from gsisio_jax.plant.calls import as_vector, check_map, hashable, takes_u
+from gsisio_jax.interval.reading import check_type, read_array
+from gsisio_jax.plant.calls import as_static, as_vector, check_map, hashable, takes_u
 from gsisio_jax.plant.captured import Captured, captured, changed
 from gsisio_jax.plant.periodic import Periods, check_feedthrough, check_states, read_periods, turns
 
@@ -81,7 +82,7 @@ class System(eqx.Module):
         periodic: Mapping[int, float] | None = None,
         periodic_states: Mapping[int, float] | None = None,
     ):
-        self.f, self.g = f, g
+        self.f, self.g = as_static(f), as_static(g)
         self.G, self.H = _matrix("G", G), _matrix("H", H)
         if self.G.shape[1] != self.H.shape[1]:
             raise ValueError(
@@ -175,8 +176,7 @@ class Noise(eqx.Module):
 
     def __init__(self, w: Interval, v: Interval):
         for name, box in (("w", w), ("v", v)):
-            if not isinstance(box, Interval):
-                raise ValueError(f"Noise: `{name}` must be a gsisio_jax.Interval, got {type(box).__name__}")
+            check_type("Noise", name, box, Interval, "gx.Interval.symmetric(r) is the box from -r to r")
             values = (box.lower, box.upper)
             if all(is_concrete(x) for x in values) and not all(np.isfinite(np.asarray(x)).all() for x in values):
                 raise ValueError(
@@ -199,10 +199,13 @@ class Noise(eqx.Module):
 
 
 def _matrix(name: str, value: Any, shape: tuple[int, int] | None = None) -> np.ndarray:
+    matrix = read_array("System", name, value)
     try:
-        matrix = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"System: {name} must be a matrix of real numbers, got {value!r}") from error
+        matrix = np.asarray(matrix, np.float64)
+    except TypeError as error:  # JAX traces it
+        raise ValueError(
+            f"System: `{name}` is traced by JAX, and must be known; make the System outside of jit, vmap and grad"
+        ) from error
     if matrix.ndim != 2:
         raise ValueError(f"System: {name} must be a matrix (2 dimensions), got shape {matrix.shape}")
     if shape is not None and matrix.shape != shape:
@@ -257,8 +260,7 @@ def _check_rank(G: np.ndarray, H: np.ndarray) -> None:
 def _bounds(name: str, box: Interval | None, size: int) -> Interval:
     if box is None:
         return Interval.entire(size)
-    if not isinstance(box, Interval):
-        raise ValueError(f"System: `{name}` must be a gsisio_jax.Interval of shape ({size},), got {type(box).__name__}")
+    check_type("System", name, box, Interval, f"gx.Interval(lower, upper) of shape ({size},)")
     if box.shape != (size,):
         raise ValueError(f"System: `{name}` must have shape ({size},), got {box.shape}; use -inf and inf where unknown")
     return box

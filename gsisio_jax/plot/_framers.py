@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax.interval.reading import read_array
 from gsisio_jax.plot import style
 from gsisio_jax.plot.record import Record, Series, read_record
 from gsisio_jax.plot.study import check_signals
@@ -127,7 +128,7 @@ def true_rows(call: str, name: str, truth: Any, steps: int, lead: tuple[int, ...
     Raises:
         ValueError: the truth has another shape.
     """
-    truth = np.asarray(truth, dtype=np.float64)
+    truth = np.asarray(read_array(call, f"truth of '{name}'", truth, missing=True), dtype=np.float64)
     if truth.shape[:-1] not in ((), lead) or truth.ndim == 0 or truth.shape[-1] - steps not in (-1, 0, 1):
         legal = " or ".join(str((*front, steps)) for front in dict.fromkeys([(), lead]))
         raise ValueError(f"{call}: the truth of '{name}' must have shape {legal}, got {truth.shape}")

@@ -116,6 +116,11 @@ def _read_case(dataset: Any, call: str) -> Record:
 
 
 def _read_estimate(est: Any, call: str) -> Record:
+    if not hasattr(est, "state"):
+        raise ValueError(
+            f"{call}: expected an estimate, or a dataset of `to_dataset` or of a study with reduce=None; got "
+            f"{type(est).__name__}"
+        )
     if np.ndim(est.state.lower) != 2:
         raise ValueError(f"{call}: one record is needed, est.state of shape (T, n), got {np.shape(est.state.lower)}")
     series = {}

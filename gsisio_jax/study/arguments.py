@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import read_array
 from gsisio_jax.plant.system import Noise, System
 from gsisio_jax.study.axes import Axis, Truth, bare
 
@@ -37,7 +38,7 @@ def prepare(call: str, system: System, arguments: Mapping[str, Any]) -> tuple[di
         name, kind = ("noise", "Noise") if isinstance(initial, Interval) else ("initial", "Interval")
         got = type(bare(arguments[name])).__name__
         raise ValueError(f"{call}: `{name}` must be a gsisio_jax.{kind}, bare or wrapped by gx.grid; got {got}")
-    y = _floating(y)
+    y = np.asarray(read_array(call, "y", y, missing=True))
     _expect(call, "y", y, [(None, system.l)])
     steps = y.shape[-2]
     if steps == 0:
@@ -76,7 +77,7 @@ def _known_input(call: str, system: System, u: Any, steps: int, dtype: Any) -> n
         if system.m > 0:
             raise ValueError(f"{call}: the system has {system.m} known inputs; give `u` of shape ({steps}, {system.m})")
         return np.zeros((steps, 0), dtype)
-    u = np.asarray(u, dtype)
+    u = np.asarray(read_array(call, "u", u), dtype)
     _expect(call, "u", u, [(steps, system.m)])
     _refuse(call, "u", u, lambda a: ~np.isfinite(a), "not finite; a known input cannot be missing")
     return u
@@ -85,7 +86,7 @@ def _known_input(call: str, system: System, u: Any, steps: int, dtype: Any) -> n
 def _lengths(call: str, length: Any, steps: int) -> np.ndarray | None:
     if length is None:
         return None
-    length = np.asarray(length)
+    length = np.ma.filled(length, -1) if isinstance(length, np.ma.MaskedArray) else np.asarray(length)
     _expect(call, "length", length, [()])
     if not np.issubdtype(length.dtype, np.integer):
         raise ValueError(f"{call}: `length` must hold integers, got {length.dtype}")
@@ -103,7 +104,7 @@ def _truth(call: str, system: System, truth: Any, steps: int, dtype: Any) -> Tru
         return None
     if not isinstance(truth, tuple) or len(truth) != 2:
         raise ValueError(f"{call}: `truth` must be a pair (x, d), d may be None; got {type(truth).__name__}")
-    x, d = (None if part is None else np.asarray(part, dtype) for part in truth)
+    x, d = (None if part is None else np.asarray(read_array(call, "truth", part), dtype) for part in truth)
     if x is None:
         raise ValueError(f"{call}: `truth` must hold the true states: truth=(x, d) or (x, None)")
     _expect(call, "truth", x, [(steps, system.n), (steps + 1, system.n)])
@@ -113,11 +114,6 @@ def _truth(call: str, system: System, truth: Any, steps: int, dtype: Any) -> Tru
         if part is not None:
             _refuse(call, "truth", part, lambda a: ~np.isfinite(a), "not finite; shorten the record with `length`")
     return Truth(x, d)
-
-
-def _floating(value: Any) -> Any:
-    value = np.asarray(value)
-    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(np.float64)
 
 
 def _expect(call: str, name: str, value: Any, legal: list[tuple[int | None, ...]], besides: str = "") -> None:

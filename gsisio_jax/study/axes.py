@@ -67,6 +67,8 @@ def grid(name: str, value: Any, coordinate: Any = None, unit: str = "") -> Axis:
     if isinstance(value, Axis):
         raise ValueError(f"grid: the value of {name!r} lies on the axis {value.name!r} already; wrap it once")
     if coordinate is not None:
+        if isinstance(coordinate, np.ma.MaskedArray) and np.ma.is_masked(coordinate):
+            raise ValueError(f"grid: `coordinate` of {name!r} has masked entries; every element needs its label")
         coordinate = np.asarray(coordinate)
         if coordinate.ndim != 1:
             raise ValueError(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gsisio_jax.interval.reading import read_array
 from gsisio_jax.observer.status import flag_attributes
 from gsisio_jax.plant.system import System
 from gsisio_jax.study.axes import Layout
@@ -54,7 +55,7 @@ class Labels(NamedTuple):
                         f"{call}: `{kind}_{what}` has {len(values)} entries, the system has {count}; give one for each"
                     )
         if time is not None:
-            time = np.asarray(time, dtype=np.float64)
+            time = np.asarray(read_array(call, "time", time), dtype=np.float64)
             if time.shape != (steps,):
                 raise ValueError(f"{call}: `time` must have shape ({steps},), one per step; got {time.shape}")
         return cls(names, units, time, steps)

@@ -10,14 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax._extras import need
+from gsisio_jax.errors import ContainmentLost
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import read_array
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer import checks
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.estimation import OnConflict
+from gsisio_jax.plant.simulation import read_key
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.study.arguments import prepare
-from gsisio_jax.study.axes import RUN, Axis, Layout
+from gsisio_jax.study.axes import RUN, Axis, Layout, bare
 from gsisio_jax.study.containment import Containment, TrueRun
 from gsisio_jax.study.job import Job
 from gsisio_jax.study.labels import Labels
@@ -26,6 +29,7 @@ from gsisio_jax.study.reductions import resolve
 from gsisio_jax.study.run import run
 from gsisio_jax.study.summary import check_confidence, summary
 from gsisio_jax.study.truth import Coverage
+from gsisio_jax.tracing import explanation
 
 CALL = "monte_carlo"
 # Dimensions of every argument of one case.
@@ -117,7 +121,7 @@ def monte_carlo(
     check_confidence(CALL, confidence)
     system = observer.system
     numbers = _numbers(runs)
-    key = _key(key)
+    key = read_key(CALL, key)
     _check_steps(steps)
     if not callable(draw) and draw not in ("uniform", "vertices"):
         raise ValueError(f'{CALL}: `draw` must be "uniform", "vertices" or a function, got {draw!r}')
@@ -132,6 +136,8 @@ def monte_carlo(
         "u": u, "length": None, "truth": None,
     }  # fmt: skip
     prepared, dtype = prepare(CALL, system, given)
+    if on_miss == "raise" and start is not None:
+        _check_start(start, bare(prepared["initial"]), of_point)
     arguments = {name: prepared[name] for name in ("initial", "noise", "u")}
     if start is not None:
         start = jax.tree.map(lambda a: np.asarray(a, dtype), start)
@@ -164,17 +170,6 @@ def _numbers(runs: int | Sequence[int]) -> np.ndarray:
     return numbers.astype(np.uint32)
 
 
-def _key(key: Any) -> Any:
-    if isinstance(key, int | np.integer):
-        return jax.random.key(int(key))
-    if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0:
-        return key
-    try:
-        return jax.random.wrap_key_data(jnp.asarray(key))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{CALL}: `key` must be one key of jax.random or an integer seed; got {key!r}") from error
-
-
 def _check_steps(steps: Any) -> None:
     if not isinstance(steps, int | np.integer) or steps < 1:
         raise ValueError(f"{CALL}: `steps` must be the number of measurements of a run, at least 1; got {steps!r}")
@@ -191,14 +186,30 @@ def _first_states(system: Any, x0: Any, draw: Any) -> tuple[Any, bool]:
                 f"{np.asarray(x0.width)}; for states from elsewhere give a function x0(key)"
             )
         return x0, False
-    point = np.asarray(x0, dtype=np.float64)
+    point = np.asarray(read_array(CALL, "x0", x0), dtype=np.float64)
     if point.shape != (system.n,) or not np.isfinite(point).all():
         raise ValueError(f"{CALL}: `x0` must be a box, a finite point ({system.n},) or a function of a key; got {x0!r}")
     return point, True
 
 
+def _check_start(x0: Any, initial: Interval, of_point: bool) -> None:
+    """Refuse first states outside of the boxes that the observer is given before anything is compiled for them."""
+    lower, upper = (x0, x0) if of_point else (np.asarray(x0.lower), np.asarray(x0.upper))
+    # The boxes have been rounded outward where they are narrower, the states to nearest: within an ulp of each other.
+    kind = initial.lower.dtype
+    outside = (lower.astype(kind) < initial.lower) | (upper.astype(kind) > initial.upper)
+    if outside.any():
+        component = int(np.argwhere(outside)[0][-1])
+        low, high = (np.reshape(side, (-1, len(lower)))[:, component] for side in (initial.lower, initial.upper))
+        raise ContainmentLost(
+            f"{CALL}: `x0` of x{component + 1} is {lower[component]:g} to {upper[component]:g}, outside of the box "
+            f"`initial` of the observer, {low.max():g} to {high.min():g}, where the boxes promise nothing. Give a "
+            'larger `initial` (or on_miss="record" to count such runs)'
+        )
+
+
 def _input(d: Any, steps: int, size: int, dtype: Any) -> np.ndarray:
-    d = np.asarray(d, dtype)
+    d = np.asarray(read_array(CALL, "d", d), dtype)
     if d.shape != (steps, size) or not np.isfinite(d).all():
         raise ValueError(
             f"{CALL}: `d` must be a finite array ({steps}, {size}) or a function d(key, k, x), got shape {d.shape}"
@@ -224,7 +235,7 @@ def _check_functions(system: Any, key: Any, arguments: Any, dtype: Any, x0: Any,
             shapes = [np.shape(leaf) for leaf in jax.tree.leaves(jax.eval_shape(function, *given))]
         except Exception as error:
             raise ValueError(
-                f"{CALL}: {name} must be a function that JAX can trace and return {expected}. {error}"
+                f"{CALL}: {name} must be a function that JAX can trace and return {expected}. {explanation(error)}"
             ) from error
         if shapes != [(size,) for size in sizes]:
             raise ValueError(f"{CALL}: {name} must return {expected}, got {' and '.join(map(str, shapes))}")

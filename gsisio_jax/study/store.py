@@ -65,6 +65,8 @@ class TileStore:
             MissingExtra: zarr is not installed.
         """
         need("zarr", extra="study", purpose="storing a study")
+        if not isinstance(path, str | os.PathLike):
+            raise ValueError(f"store: `store` must be the path of a folder, got {type(path).__name__}")
         path, header = Path(path).absolute(), checked(header)
         store = cls(path, header)
         with one_line_os_error(f"store: cannot create {path}", "nothing was written"):

@@ -25,6 +25,7 @@ from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.observer.rounding_constants import slopes_of
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise, System
@@ -101,9 +102,11 @@ def allocate(
 
     Source: theory 4 and 6.
     """
+    check_type("allocate", "system", system, System)
+    check_type("allocate", "noise", noise, Noise, "gx.Noise(w, v)")
     if not isinstance(region, Interval) or region.shape != (system.n,):
         raise ValueError(f"allocate: `region` must be an Interval of shape ({system.n},), got {region!r}")
-    required = np.asarray(required, float)
+    required = np.asarray(read_array("allocate", "required", required), float)
     if required.shape != (system.n,) or not (required > 0).all() or not np.isfinite(required).any():
         raise ValueError(
             f"allocate: `required` must hold {system.n} positive widths, inf where none is required, got {required}"

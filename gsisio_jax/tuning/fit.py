@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.tuning import search as searching
@@ -82,7 +83,10 @@ def tune_noise(
     shape = read_shape("tune_noise", template, parameters)
     fitted, everything = _split(records, held_out, system)
     evidence = identify("tune_noise", system, everything.select(fitted).truth)
-    room = np.broadcast_to(np.asarray(containment_margin, float), (system.n,))
+    room = np.asarray(read_array("tune_noise", "containment_margin", containment_margin), float)
+    if room.shape not in ((), (system.n,)) or np.isnan(room).any():
+        raise ValueError(f"tune_noise: `containment_margin` must be a number or ({system.n},), got {room.tolist()}")
+    room = np.broadcast_to(room, (system.n,))
     scores = Scores(observer, shape, everything, fitted, room)
     price, base = shape.cost(_weights(observer, shape, objective, weights))
     tell = searching.to_stderr if progress is True else progress or None
@@ -172,6 +176,7 @@ def _start(shape: Shape, start: TunedNoise | Noise | None) -> np.ndarray:
     if start is None:
         return np.ones(len(shape.names))
     noise = start.noise if isinstance(start, TunedNoise) else start
+    check_type("tune_noise", "start", noise, (Noise, TunedNoise), "give earlier bounds, or leave it out")
     factors = shape.factors(noise)
     if not (np.isfinite(factors).all() and factors.any()):
         raise ValueError(f"tune_noise: `start` gives no bounds to start from, factors {factors.tolist()}")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import read_array
 from gsisio_jax.plant.system import System
 
 
@@ -61,7 +62,7 @@ class Records:
             if given is None:
                 continue
             if shared and np.ndim(given) == 2 and len(y) > 1:
-                given = [np.asarray(given)[:rows] for rows in length]
+                given = [read_array("Records", name, given)[:rows] for rows in length]
             pieces = _pieces(name, given)
             legal = {"u": (0,), "x": (0, 1), "d": (-1, 0)}[name]
             if len(pieces) != len(y):
@@ -152,12 +153,13 @@ class Records:
 
 
 def _pieces(name: str, value: Any) -> list[np.ndarray]:
-    """One float64 array (T_r, columns) per record."""
+    """One float64 array (T_r, columns) per record; what is missing is NaN."""
+    missing = name != "u"
     several = isinstance(value, Sequence) and not np.isscalar(value[0] if len(value) else 0)
     if several and np.ndim(value[0]) == 2:
-        pieces = [np.asarray(piece, float) for piece in value]
+        pieces = [np.asarray(read_array("Records", name, piece, missing), float) for piece in value]
     else:
-        array = np.asarray(value, float)
+        array = np.asarray(read_array("Records", name, value, missing), float)
         pieces = list(array if array.ndim == 3 else array[None])
     for r, piece in enumerate(pieces):
         if piece.ndim != 2 or piece.shape[1] != pieces[0].shape[1]:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.plant.system import Noise
 
 Parameters = str | Mapping[str, Any]
@@ -85,6 +86,7 @@ def read_shape(call: str, template: Noise, parameters: Parameters) -> Shape:
     Raises:
         ValueError: the template changes with time, the words are unknown, or nothing is left to fit.
     """
+    check_type(call, "noise", template, Noise, "gx.Noise(w, v)")
     sizes = [box.shape[-1] for box in (template.w, template.v)]
     if any(len(box.shape) != 1 for box in (template.w, template.v)):
         raise ValueError(f"{call}: the noise to fit must be constant, of shapes (n,) and (l,); it changes with time")

@@ -7,7 +7,15 @@ import pytest
 CASES = {
     "unknown key": ('time = "t"', 'tiem = "t"', ["cart.toml: unknown key table.tiem; did you mean time?"]),
     "misspelt key": ('missing = [-9999, "n/a"]', "mising = []", ["unknown key table.mising", "did you mean missing?"]),
-    "unknown section": ("[outputs]", "[pictures]", ["unknown key pictures", "keys here are", "outputs"]),
+    "unknown section": ("[outputs]", "[pictures]", ["unknown section pictures", "keys here are", "outputs"]),
+    "misspelt section": ("[noise]", "[nois]", ["cart.toml: unknown section nois; did you mean noise?"]),
+    "noise number": (
+        "w = {radius = [0.001, 0.001]}",
+        "w = 0.01",
+        ["noise.w: must be a box, got 0.01", "radius = [0.01]"],
+    ),
+    "noise list": ("w = {radius = [0.001, 0.001]}", "w = [1, 2]", ["noise.w: must be a box", "{ radius = [1, 2] }"]),
+    "box of text": ("w = {radius = [0.001, 0.001]}", 'w = "0.1"', ["noise.w: must be a box", "radius = [...]"]),
     "signal key": ('name = "force", unit', 'name = "force", units', ["signals.input[0].units", "did you mean unit?"]),
     "wrong type": (
         "sample_time = 0.1",

@@ -31,7 +31,7 @@ def cart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 PUSH = '"study_cart_model:push"'
 MISTAKES = {
-    "no table": ("sweep", "[table]\n", "[tabel]\n", ["unknown key tabel", "did you mean table?"]),
+    "no table": ("sweep", "[table]\n", "[tabel]\n", ["unknown section tabel", "did you mean table?"]),
     "axis": ("sweep", "[sweep.axes.noise]", "[sweep.axes.niose]", ["sweep.axes.niose", "did you mean noise?"]),
     "axis key": ("sweep", "scale = [1, 2, 4]", "scales = [1]", ["sweep.axes.noise.scales", "did you mean scale?"]),
     "alias": ("monte-carlo", "from = 0.5", "form = 0.5", ["monte_carlo.axes.noise.form", "did you mean from?"]),
