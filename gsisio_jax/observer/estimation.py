@@ -78,7 +78,8 @@ def estimate(
     Args:
         observer: from `design_observer`.
         initial: box of x[0] before y[0], (n,); infinite sides allowed.
-        y: measurements (T, l), units of the outputs; NaN marks a missing entry.
+        y: measurements (T, l), units of the outputs; NaN marks a missing entry, as do masked entries of NumPy, NA of
+            pandas and None.
         u: known inputs (T, m), finite; needed where m > 0.
         noise: bounds at run time; None takes those of the design. Bounds of shape (T, .) change with time.
         on_conflict: where the data contradict the bounds, go on from y[k] and the state bounds alone ("restart"), or
