@@ -199,12 +199,13 @@ def _check_start(x0: Any, initial: Interval, of_point: bool) -> None:
     kind = initial.lower.dtype
     outside = (lower.astype(kind) < initial.lower) | (upper.astype(kind) > initial.upper)
     if outside.any():
-        component = int(np.argwhere(outside)[0][-1])
-        low, high = (np.reshape(side, (-1, len(lower)))[:, component] for side in (initial.lower, initial.upper))
+        i = int(np.argwhere(outside)[0][-1])
+        low, high = (np.reshape(side, (-1, len(lower)))[:, i] for side in (initial.lower, initial.upper))
+        at = f"{lower[i]:g}" if of_point else f"{lower[i]:g} to {upper[i]:g}"
         raise ContainmentLost(
-            f"{CALL}: `x0` of x{component + 1} is {lower[component]:g} to {upper[component]:g}, outside of the box "
-            f"`initial` of the observer, {low.max():g} to {high.min():g}, where the boxes promise nothing. Give a "
-            'larger `initial` (or on_miss="record" to count such runs)'
+            f"{CALL}: the first state lies outside of the initial box, where the boxes promise nothing: x{i + 1} of "
+            f"`x0` is {at}, of `initial` {low.max():g} to {high.min():g}. Give a larger `initial` (or "
+            'on_miss="record", to count such runs)'
         )
 
 

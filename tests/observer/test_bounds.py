@@ -244,7 +244,7 @@ Y, U, BOX = np.zeros((4, 2)), np.zeros((4, 2)), Interval.symmetric([1.0, 1.0])
     ("arguments", "words"),
     [
         ((Interval.symmetric([1.0]), Y, U), "`initial` must be an Interval of shape"),
-        (([0.0, 0.0], Y, U), "`initial` must be an Interval"),
+        (([0.0, 0.0], Y, U), "`initial` must be a"),
         ((BOX, np.zeros((4, 3)), U), "measurements must have shape"),
         ((BOX, np.zeros(2), U), "measurements must have shape"),
         ((BOX, np.zeros((0, 2)), np.zeros((0, 2))), "T >= 1"),
