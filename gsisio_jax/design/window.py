@@ -11,7 +11,7 @@ import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window_program import WindowProgram
-from gsisio_jax.design.window_runs import FAR, RUNS, Rows, Runs
+from gsisio_jax.design.window_runs import FAR, RUNS, Rows, Runs, sizes_of_parts
 from gsisio_jax.observer.window import Window
 
 _SAMPLES = 24  # steps of a round for which exact rows are asked
@@ -84,7 +84,7 @@ def _profile_rows(problem: GainProblem, length: int) -> tuple[Rows, np.ndarray]:
         program = WindowProgram.of(problem, steps, length)
         best = []
         for _ in range(30 if steps == 1 else 3):
-            size = _profile(problem, length, half)
+            size = sizes_of_parts(problem, [half] * length)
             best = [program.best(state, size, np.zeros_like(size)) for state in range(problem.n)]
             reached = np.array([np.inf if row is None else row[1] for row in best])
             reached = np.minimum(reached, FAR)
@@ -96,16 +96,6 @@ def _profile_rows(problem: GainProblem, length: int) -> tuple[Rows, np.ndarray]:
             if row is not None:
                 rows.add(state, row[0])
     return rows, half
-
-
-def _profile(problem: GainProblem, length: int, half: np.ndarray) -> np.ndarray:
-    of_f, of_g = problem.dw / 2 + problem.F_radius @ half, problem.dv / 2 + problem.E_radius @ half
-    return np.concatenate(
-        [
-            np.tile(half, length), np.tile(of_f, length), np.tile(of_g, length), problem.dv / 2, problem.R @ half,
-            np.tile(problem.dd / 2, length),
-        ]
-    )  # fmt: skip
 
 
 def _useful(rows: Rows, steps: list, n: int) -> list[int]:

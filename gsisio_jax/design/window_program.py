@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -21,7 +22,6 @@ class WindowProgram:
         parts: (k, unknowns), with `offset` (k, n) for each state: slopes on the boxes of x, lambda, a, ``n_z T2``, n_z,
             and what is left of bounded inputs; blocks over N steps, the oldest first.
         equal: (e, unknowns), with `equal_offset` (e, n): must vanish, so that free inputs cancel.
-        multipliers: places of lambda in `parts`.
     """
 
     parts: np.ndarray
@@ -70,16 +70,21 @@ class WindowProgram:
         ]  # fmt: skip
         return cls(np.vstack(parts), np.vstack(offset), np.vstack(equal), np.vstack(equal_offset))
 
+    @cached_property
+    def _constraints(self) -> sparse.csc_array:
+        """Parts as differences of two nonnegative unknowns, and what must vanish."""
+        k = len(self.parts)
+        rows = sparse.hstack([sparse.csr_array(self.parts), -sparse.eye_array(k), sparse.eye_array(k)])
+        if len(self.equal):
+            rows = sparse.vstack([rows, sparse.hstack([self.equal, sparse.csr_array((len(self.equal), 2 * k))])])
+        return sparse.csc_array(rows)
+
     def best(self, state: int, size: np.ndarray, drift: np.ndarray) -> tuple[np.ndarray, float] | None:
         """The parts of the row with the least ``size |parts| + drift parts``, and that; None where there is none."""
         k, count = self.parts.shape
-        split = [sparse.csr_array(self.parts), -sparse.eye_array(k), sparse.eye_array(k)]
-        rows = sparse.hstack(split)
-        if len(self.equal):
-            rows = sparse.vstack([rows, sparse.hstack([self.equal, sparse.csr_array((len(self.equal), 2 * k))])])
         found = linprog(
             np.concatenate([np.zeros(count), size + drift, size - drift]),
-            A_eq=sparse.csc_array(rows),
+            A_eq=self._constraints,
             b_eq=-np.concatenate([self.offset[:, state], self.equal_offset[:, state]]),
             bounds=[(None, None)] * count + [(0, None)] * (2 * k),
             method="highs-ds",

@@ -83,17 +83,21 @@ class Runs:
         ]
         off, half = [box[0] for box in boxes], [box[1] for box in boxes]
         none_w, none_v = np.zeros((RUNS, n)), np.zeros((RUNS, P.l))
-        of_f = [P.dw / 2 + h @ P.F_radius.T for h in half]
-        of_g = [P.dv / 2 + h @ P.E_radius.T for h in half]
-        of_z = half[-1] @ P.R.T
-        known = np.tile(P.dd / 2, (RUNS, N))
-        size = [*half, *of_f, *of_g, np.tile(P.dv / 2, (RUNS, 1)), of_z, known]
         drift = [
             *off,
             *(-w[:, j] if j >= 0 else none_w for j in range(k - N, k)),
             *(v[:, j] if j >= 0 else none_v for j in range(k - N, k)),
             v[:, k],
-            np.zeros_like(of_z),
-            np.zeros_like(known),
+            np.zeros((RUNS, P.q + N * len(P.dd))),
         ]
-        return np.concatenate(size, 1), np.concatenate(drift, 1)
+        return sizes_of_parts(P, half), np.concatenate(drift, 1)
+
+
+def sizes_of_parts(problem: GainProblem, half: list[np.ndarray]) -> np.ndarray:
+    """What the parts of a row (`WindowProgram.parts`) count, (..., k), for boxes of half widths `half` (..., n), the
+    oldest step first."""
+    lead = half[-1].shape[:-1]
+    w, v, d = (np.broadcast_to(0.5 * width, (*lead, len(width))) for width in (problem.dw, problem.dv, problem.dd))
+    of_f = [w + h @ problem.F_radius.T for h in half]
+    of_g = [v + h @ problem.E_radius.T for h in half]
+    return np.concatenate([*half, *of_f, *of_g, v, half[-1] @ problem.R.T, *[d] * len(half)], -1)

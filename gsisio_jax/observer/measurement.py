@@ -10,7 +10,7 @@ from gsisio_jax import inclusion
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, choose, entire_like
 from gsisio_jax.interval.image import image
-from gsisio_jax.plant.system import System
+from gsisio_jax.plant.system import Noise, System
 
 
 def value_at(function: Any, x: Any, *args: Any) -> Interval:
@@ -30,6 +30,13 @@ def output_box(system: System, y: Any, u: Any, v: Interval) -> Interval:
     else:  # one rounding, which `widened_for_sums` has room for
         known = Interval.unchecked(seen - v.upper, seen - v.lower)
     return choose(missing, entire_like(known), known)
+
+
+def shift_box(system: System, y: Any, u: Any, noise: Noise) -> Interval:
+    """Box (n + l,) of ``[B u + w; D u + v - y]``: what is known of a step besides f, g and d."""
+    drift = add(image(system.B, point(u)), noise.w) if system.m else noise.w
+    seen = output_box(system, y, u, noise.v)
+    return Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
 
 
 def point(value: Any) -> Interval:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, add, choose, entire_like, nan_to_unbounded
+from gsisio_jax.interval.box import Interval, choose, entire_like, nan_to_unbounded
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
 from gsisio_jax.observer import periodic, window
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
@@ -25,7 +25,7 @@ from gsisio_jax.observer.initial import FirstForm, initial_boxes
 from gsisio_jax.observer.input_boxes import dynamics, exact_from_box, from_inverses, moved_without
 from gsisio_jax.observer.lost import Lost, plainly_wider
 from gsisio_jax.observer.maps import Maps
-from gsisio_jax.observer.measurement import everything_unless, in_box, inside, output_box, point, typed
+from gsisio_jax.observer.measurement import everything_unless, in_box, inside, output_box, shift_box, typed
 from gsisio_jax.observer.status import Source, Status, bit_mask
 from gsisio_jax.observer.types import Carry, Observer, StepOutput
 from gsisio_jax.plant.system import Noise
@@ -74,9 +74,7 @@ def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold
 def _known(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise) -> Known:
     system, bounds = observer.system, observer.system.state_bounds
     output = output_box(system, y, u, noise.v)
-    drift = add(image(system.B, point(carry.u)), carry.noise.w) if system.m else carry.noise.w
-    seen = output_box(system, carry.y, carry.u, carry.noise.v)
-    shift = Interval.unchecked(jnp.concatenate([drift.lower, -seen.upper]), jnp.concatenate([drift.upper, -seen.lower]))
+    shift = shift_box(system, carry.y, carry.u, carry.noise)
     terms = Terms(
         shift, output, image(observer.bounded_states, bounds), image(observer.bounded_inputs, system.input_bounds)
     )

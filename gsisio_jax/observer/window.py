@@ -16,13 +16,13 @@ import numpy as np
 
 from gsisio_jax.inclusion.atoms import AtomBounds, States, wider
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, add, entire_like, magnitude
+from gsisio_jax.interval.box import Interval, entire_like, magnitude
 from gsisio_jax.interval.image import image, loose_matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.contractors import Affine
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.lost import Lost, plainly_wider
-from gsisio_jax.observer.measurement import everything_unless, output_box, point
+from gsisio_jax.observer.measurement import everything_unless, output_box, shift_box
 from gsisio_jax.observer.status import Source
 from gsisio_jax.plant.system import Noise
 
@@ -174,15 +174,10 @@ def contract(
 def _known(observer: Any, past: Past, terms: int) -> Interval:
     """[B u + w; D u + v - y] of a step, and the bounds of inputs that have them, widened for sums."""
     system = observer.system
-    drift = add(image(system.B, point(past.u)), past.noise.w) if system.m else past.noise.w
-    seen, bounded = (
-        output_box(system, past.y, past.u, past.noise.v),
-        image(observer.bounded_inputs, system.input_bounds),
-    )
-    lower = jnp.concatenate([drift.lower, -seen.upper, bounded.lower])
-    return widened_for_sums(
-        Interval.unchecked(lower, jnp.concatenate([drift.upper, -seen.lower, bounded.upper])), terms
-    )
+    shift = shift_box(system, past.y, past.u, past.noise)
+    bounded = image(observer.bounded_inputs, system.input_bounds)
+    lower, upper = (jnp.concatenate([getattr(box, side) for box in (shift, bounded)]) for side in ("lower", "upper"))
+    return widened_for_sums(Interval.unchecked(lower, upper), terms)
 
 
 def _added(total: Any, part: Any) -> Any:
