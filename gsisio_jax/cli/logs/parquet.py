@@ -33,8 +33,7 @@ def parquet_blocks(
     file = _opened(path)
     span = _range_index(file)
     stored = {_name(one): one for one in file.schema_arrow.names}
-    names = [_name(one) for one in file.schema_arrow.names] + ([span[0]] if span else [])
-    check_columns(name, names, wanted)
+    check_columns(name, _names(file, span), wanted)
     done = 0
     chosen = [stored[one] for one in wanted if one in stored]
     try:
@@ -57,8 +56,7 @@ def parquet_blocks(
 def parquet_columns(path: Path) -> list[str]:
     """Names of the columns, index included."""
     file = _opened(path)
-    span = _range_index(file)
-    return [_name(one) for one in file.schema_arrow.names] + ([span[0]] if span else [])
+    return _names(file, _range_index(file))
 
 
 def parquet_frame(path: Path) -> Any:
@@ -85,6 +83,10 @@ def _opened(path: Path) -> Any:
     if file.metadata.num_rows == 0:
         raise UserError(f"{path.name}: the file has a header but no rows")
     return file
+
+
+def _names(file: Any, span: tuple[str, int, int] | None) -> list[str]:
+    return [_name(one) for one in file.schema_arrow.names] + ([span[0]] if span else [])
 
 
 def _name(stored: str) -> str:
