@@ -6,7 +6,7 @@ to stand there, and what is no real number (complex, dates, text), or none that 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Iterable, Mapping, Set
 from decimal import Decimal
 from numbers import Integral, Real
 from typing import Any, NoReturn
@@ -207,8 +207,8 @@ def _of_objects(value: np.ndarray, missing: bool, kind: str) -> np.ndarray:
         if entry is None or entry is np.ma.masked or type(entry).__name__ in ("NAType", "NaTType"):
             if value.ndim == 0:
                 _refuse("nothing (None)")
-            _check_missing(np.arange(value.size).reshape(value.shape) == np.ravel_multi_index(index, value.shape),
-                           missing, "missing")  # fmt: skip
+            if not missing:
+                _refuse_missing(index, "missing")
             found[index] = np.nan
         elif isinstance(entry, Integral):
             found[index] = _exact_integer(int(entry))
@@ -232,8 +232,12 @@ def _exact_integer(number: int) -> float:
 
 def _check_missing(absent: np.ndarray, missing: bool, what: str) -> None:
     if not missing:
-        where = [int(i) for i in np.argwhere(absent)[0]]
-        _refuse(f"an entry that is {what} at index {where}", "every entry must be known here (inf for unknown bounds)")
+        _refuse_missing(np.argwhere(absent)[0], what)
+
+
+def _refuse_missing(index: Iterable[int], what: str) -> NoReturn:
+    where = [int(i) for i in index]
+    _refuse(f"an entry that is {what} at index {where}", "every entry must be known here (inf for unknown bounds)")
 
 
 def _refuse_complex() -> NoReturn:

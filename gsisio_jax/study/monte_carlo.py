@@ -203,8 +203,8 @@ def _check_start(x0: Any, initial: Interval, of_point: bool) -> None:
         low, high = (np.reshape(side, (-1, len(lower)))[:, i] for side in (initial.lower, initial.upper))
         at = f"{lower[i]:g}" if of_point else f"{lower[i]:g} to {upper[i]:g}"
         raise ContainmentLost(
-            f"{CALL}: the first state lies outside of the initial box, where the boxes promise nothing: x{i + 1} of "
-            f"`x0` is {at}, of `initial` {low.max():g} to {high.min():g}. Give a larger `initial` (or "
+            f"{CALL}: `x0` of x{i + 1} is {at}: the first state lies outside of the initial box, where the boxes "
+            f"promise nothing; `initial` is {low.max():g} to {high.min():g} there. Give a larger `initial` (or "
             'on_miss="record", to count such runs)'
         )
 
