@@ -16,7 +16,8 @@ from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.certificate import Certificate
-from gsisio_jax.observer.rounding_constants import Slopes, with_output
+from gsisio_jax.observer.enclosures import Slopes
+from gsisio_jax.observer.rounding_constants import with_output
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise, System
 

@@ -9,6 +9,7 @@ from typing import Any, Literal, overload
 import numpy as np
 
 from gsisio_jax.design.assemble import Plan, assemble
+from gsisio_jax.design.dead_beat import dead_beat_rows
 from gsisio_jax.design.existence import check_existence
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.first_gain import first_gain
@@ -24,15 +25,17 @@ from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
-from gsisio_jax.design.recovery import recovers
+from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.region import find_region
 from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
+from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
 from gsisio_jax.observer.prediction_step import PredictionObserver
-from gsisio_jax.observer.rounding_constants import Slopes, first_form, slopes_of, with_rounding_constants
+from gsisio_jax.observer.recovery_constants import AffineMaps
+from gsisio_jax.observer.rounding_constants import with_rounding_constants
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise, System
 
@@ -156,13 +159,15 @@ def design_observer(
     if window != 1:
         rows = window_rows(problem, window, width)
         observer = replace(observer, window=rows)
+    maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
+    if maps is not None:
+        observer = replace(observer, recovery=dead_beat_rows(problem, maps, width))
     observer = with_rounding_constants(observer, system, first.slopes, everywhere, outputs, slack, np.float64)
     if certify:
         check_initial_contraction(problem, bank[0], observer, outputs)
     if not missing:
         return observer
-    certificate = replace(observer.certificate, recoverable=recovers(observer, width, u_region))
-    return replace(observer, certificate=certificate)
+    return replace(observer, certificate=with_recovery(observer, width, u_region))
 
 
 def _check(

@@ -11,7 +11,7 @@ import numpy as np
 from gsisio_jax.design.feedthrough import Feedthrough
 from gsisio_jax.design.problem import GainProblem, beyond_rounding
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
-from gsisio_jax.observer.rounding_constants import Slopes
+from gsisio_jax.observer.enclosures import Slopes
 from gsisio_jax.plant.system import System
 
 _ZERO = 1e-9  # in units of normalised directions

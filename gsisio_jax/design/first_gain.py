@@ -21,7 +21,7 @@ from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.inclusion.culprits import Culprit, culprits
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer.rounding_constants import Slopes
+from gsisio_jax.observer.enclosures import Slopes
 
 _HALVINGS, _BISECTIONS = 10, 5  # of the region, in search of a scale at which a design exists
 

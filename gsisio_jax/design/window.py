@@ -36,7 +36,7 @@ def window_rows(problem: GainProblem, length: int | str, width: np.ndarray, seed
     scaled = problem.scaled(width)
     if isinstance(length, int):
         found = _collected(scaled, length, seed)
-        return None if found is None else _as_window(problem, length, *found, width)
+        return None if found is None else as_window(problem, length, *found, width)
     rows, half = _profile_rows(scaled, 1)
     reached, chosen = _widths(scaled, 1, rows, half, seed), None
     for steps in _TRIED:
@@ -46,7 +46,7 @@ def window_rows(problem: GainProblem, length: int | str, width: np.ndarray, seed
         narrower = _widths(scaled, steps, found[0].kept(found[1]), half, seed)
         if (narrower < (1 - _WORTH) * reached).any():
             reached, chosen = np.minimum(narrower, reached), (steps, *found)
-    return None if chosen is None else _as_window(problem, *chosen, width)
+    return None if chosen is None else as_window(problem, *chosen, width)
 
 
 def _collected(problem: GainProblem, length: int, seed: int) -> tuple[Rows, list[int]] | None:
@@ -118,7 +118,9 @@ def _useful(rows: Rows, steps: list, n: int) -> list[int]:
     return kept
 
 
-def _as_window(problem: GainProblem, length: int, rows: Rows, kept: list[int], x: np.ndarray) -> Window:
+def as_window(
+    problem: GainProblem, length: int, rows: Rows, kept: list[int], x: np.ndarray, shortened: bool = True
+) -> Window:
     """The kept rows in the units of the plant, newest step first; see `GainProblem.scaled`."""
     n, l, q, N, R = problem.n, problem.l, problem.q, length, len(kept)
     b = int((~problem.free).sum())
@@ -136,7 +138,8 @@ def _as_window(problem: GainProblem, length: int, rows: Rows, kept: list[int], x
     # Rows that look back farthest come first, so that those of a lag are the first ones.
     depth = np.array([max(np.flatnonzero((multipliers[:, r] != 0).any(-1)), default=-1) + 1 for r in range(R)])
     order = np.argsort(-depth, kind="stable")
-    N = max(1, int(depth.max()))  # older steps are in no row that was kept
+    if shortened:
+        N = max(1, int(depth.max()))  # older steps are in no row that was kept
     multipliers, remainder = multipliers[:N, order], remainder[order]
     stacked = np.vstack([problem.G, problem.H])
     return Window(

@@ -32,6 +32,10 @@ class Certificate(eqx.Module):
             the certificate is empty.
         equality_residual: largest entry of ``G - N_y H - N_z C G`` in the columns of free inputs.
         recoverable: after one lost row of measurements the boxes become finite again (None: not examined).
+        recovery_steps: (n,) after how many steps from the first measurement boxes are finite if nothing is known of the
+            state before (a start from R^n, lost rows, a conflict); ``inf``: not within n + 4 steps; () where it was not
+            examined. Proved where f and g have affine bounds, else tried without noise from the centre of the region.
+        recovery_width: (n,) width of the boxes then (of those at the end of the trial), at the noise of the design.
         notes: what a reader should know besides.
         framer: the boxes are certain; False only for a prediction form that is none and was asked for all the same.
 
@@ -56,6 +60,8 @@ class Certificate(eqx.Module):
     recoverable: bool | None = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
     framer: bool = eqx.field(static=True, default=True)
+    recovery_steps: tuple[float, ...] = eqx.field(static=True, default=())
+    recovery_width: Any = None
 
     @property
     def rate(self) -> float:
@@ -135,8 +141,21 @@ class Certificate(eqx.Module):
             lines.append(f"  input {j + 1:<4}{width:>14.6g}{'-':>14}{'-':>14}")
         if self.recoverable is not None:
             lines.append(f"  a lost row of measurements is {'' if self.recoverable else 'NOT '}recovered from")
+        if self.recovery_steps:
+            lines.append(self._recovery())
         lines.extend(f"  note: {note}" for note in self.notes)
         return "\n".join(lines)
+
+    def _recovery(self) -> str:
+        """From a state of which nothing is known."""
+        steps = np.array(self.recovery_steps)
+        if np.isinf(steps).all():
+            return "  from an unknown state boxes stay infinite"
+        parts = [
+            f"state {i + 1} {'stays infinite' if np.isinf(after) else f'after {after:.0f} steps, width {width:.4g}'}"
+            for i, (after, width) in enumerate(zip(steps, np.asarray(self.recovery_width), strict=True))
+        ]
+        return f"  from an unknown state: {'; '.join(parts)}"
 
     def _headline(self) -> str:
         if not self.framer:

@@ -7,23 +7,19 @@ Source: theory 3, 5 and 10.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax import inclusion
-from gsisio_jax.inclusion.transforms import AffineForm, affine_with_slack
-from gsisio_jax.interval import rounding
+from gsisio_jax.inclusion.transforms import AffineForm
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.cast import cast_down, cast_up
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.certificate import spectral_radius
+from gsisio_jax.observer.enclosures import Slopes, first_form, known, slopes_of
+from gsisio_jax.observer.recovery_constants import AffineMaps, with_constants
 from gsisio_jax.observer.residuals import (
     cancellation_residual,
     exact,
@@ -34,97 +30,9 @@ from gsisio_jax.observer.residuals import (
     window_residual,
 )
 from gsisio_jax.observer.types import InitialContraction, Observer, RoundingConstants, cast
-from gsisio_jax.scalar.numpy_program import numpy_function
 
 _UP = 1 + 1e-12  # covers the rounding of a few float64 sums of nonnegative numbers
 _STEPS = ((0.1, 1), (0.3, 3), (0.6, 5), (0.8, 8))  # see `_corrections`
-
-
-class Slopes(eqx.Module):
-    """``df in F +- F_radius``, ``dg in E +- E_radius``, ``d(T2 g) in Z +- Z_radius`` on a box, jointly bounded.
-
-    Source: theory 4.
-    """
-
-    F: np.ndarray
-    F_radius: np.ndarray
-    E: np.ndarray
-    E_radius: np.ndarray
-    Z: np.ndarray
-    Z_radius: np.ndarray
-
-    @property
-    def finite(self) -> bool:
-        """Every bound is finite."""
-        return all(np.isfinite(x).all() for x in (self.F_radius, self.E_radius, self.Z_radius))
-
-    def near_affine(self, *radii: np.ndarray) -> bool:
-        """These radii are what rounding makes of a point: the function is affine there."""
-        size = max((np.abs(x).max(initial=0.0) for x in (self.F, self.E, self.Z)), default=0.0)
-        return all((x <= 1e-12 * max(size, 1.0)).all() for x in radii)
-
-    @property
-    def affine(self) -> bool:
-        """f and g are affine there."""
-        return self.near_affine(self.F_radius, self.E_radius, self.Z_radius)
-
-
-def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) -> Callable[..., Slopes]:
-    """Enclosures of the Jacobians as a function of the box (and of that of u), uniformly over `u_box` where no other is
-    given; traced once for all boxes, run in NumPy, and computed in that type whatever JAX is set to."""
-
-    def enclose(box: Interval, u: Interval) -> list[Interval]:
-        T2_array = jnp.asarray(np.asarray(T2), dtype)
-        maps = (system.dynamics, system.measurement, lambda x, u: T2_array @ system.measurement(x, u))
-        return [inclusion.jacobian(q)(box, u) for q in maps]
-
-    program: list[Callable[..., list[Interval]]] = []
-
-    def on(box: Interval, u: Interval = u_box) -> Slopes:
-        with _able_to_hold(dtype):
-            boxes = known(box, dtype), known(u, dtype)
-            if not program:
-                program.append(numpy_function(enclose, *boxes))
-            parts = [_center_and_distance(jacobian) for jacobian in program[0](*boxes)]
-        return Slopes(*parts[0], *parts[1], *parts[2])
-
-    return on
-
-
-def known(box: Interval, dtype: Any) -> Interval:
-    """`Interval.astype` in NumPy: JAX would compile each of its operations by itself."""
-    lower, upper = (np.asarray(side) for side in (box.lower, box.upper))
-    sides = np.asarray(cast_down(lower, dtype)), np.asarray(cast_up(upper, dtype))
-    return Interval.unchecked(*rounding.normal(*sides))
-
-
-def _able_to_hold(dtype: Any) -> Any:
-    """64-bit types are switched on where they are needed. They are never switched off: JAX keeps what it has traced of
-    an f with NumPy constants, and mistakes the one for the other when the setting changes to and fro."""
-    return jax.enable_x64(True) if np.dtype(dtype) == np.float64 else nullcontext()
-
-
-def _center_and_distance(jacobian: Interval) -> tuple[np.ndarray, np.ndarray]:
-    """The center as it is in float64, and the largest distance from it, rounded up; 0 for points."""
-    lower, upper = np.array(jacobian.lower, dtype=np.float64), np.array(jacobian.upper, dtype=np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        center = Interval.unchecked(lower, upper).center
-        radius = np.maximum(upper - center, center - lower)
-    return center, np.where(lower == upper, 0.0, np.nextafter(radius, np.inf))
-
-
-def first_form(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> tuple[AffineForm, np.ndarray]:
-    """Affine bounds of T2 g on the state bounds, uniformly over `u_region`, and the slack of their slope (q, n): every
-    step begins with them.
-
-    Source: theory 5.3.
-    """
-    with _able_to_hold(dtype):
-        matrix = jnp.asarray(np.asarray(T2), dtype)
-        bounds, u_box = known(system.state_bounds, dtype), known(u_region, dtype)
-        bound = affine_with_slack(lambda x, u: matrix @ system.measurement(x, u))
-        form, slack = numpy_function(bound, bounds, u_box)(bounds, u_box)
-        return form, np.asarray(slack, np.float64)
 
 
 def contracting_gains(N_z: np.ndarray, Q: np.ndarray, C: Any, everywhere: Slopes) -> list[np.ndarray | None]:
@@ -229,6 +137,7 @@ def with_rounding_constants(
     if window is not None:
         left_x, left_d = window_residual(window, system, wide.C, wide.bounded_inputs, H_slack)
         window = _cast_window(window, left_x, left_d, wide.T2, dtype)
+    recovery = _recovery(wide, system, H_slack, dtype)
     first = InitialContraction(
         form=None if system.g_takes_u else jax.tree.map(lambda x: np.asarray(x, dtype), form),
         slack=_cast(slack, dtype),
@@ -251,6 +160,7 @@ def with_rounding_constants(
         rounding_constants=rounding_constants,
         region_inverse=_cast(inverse, dtype),
         window=window,
+        recovery=recovery,
         corrections=_corrections(spectral_radius(implicit)) if certificate.promised else 0,
         certificate=certificate,
     )
@@ -278,6 +188,21 @@ def _cast_window(window: Any, left_x: np.ndarray, left_d: np.ndarray, T2: np.nda
     stored = replace(window, output=output)
     stored = jax.tree.map(lambda x: np.asarray(x, dtype), replace(stored, left_x=np.zeros(0), left_d=np.zeros(0)))
     return replace(stored, left_x=_cast(left_x, dtype), left_d=_cast(left_d, dtype))
+
+
+def _recovery(wide: Any, system: Any, H_slack: np.ndarray, dtype: Any) -> Any:
+    """The rows of recovery, as `_cast_window`; None where they do not hold in that type."""
+    if wide.recovery is None:
+        return None
+    rows = replace(wide.recovery, output=exact(wide.recovery.remainder).dot(exact(wide.T2)).astype(np.float64))
+    rows = jax.tree.map(lambda x: np.asarray(x, dtype).astype(np.float64), rows)
+    free, maps = ~(wide.bounded_inputs != 0).any(0), AffineMaps.of(system, wide.T2, dtype)
+    found = None if maps is None else with_constants(rows, system, maps, wide.T2, H_slack, free, dtype)
+    if found is None:
+        return None
+    sides = known(found.constant, dtype)
+    upward = {name: _cast(getattr(found, name), dtype) for name in ("slack", "scales", "floor", "width")}
+    return replace(jax.tree.map(lambda x: np.asarray(x, dtype), found), constant=sides, **upward)
 
 
 def _R(slopes: Slopes, C: Any) -> np.ndarray:

@@ -16,7 +16,7 @@ from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, nan_to_unbounded
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
-from gsisio_jax.observer import periodic, window
+from gsisio_jax.observer import periodic, recovery, window
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
@@ -26,6 +26,7 @@ from gsisio_jax.observer.input_boxes import dynamics, exact_from_box, from_inver
 from gsisio_jax.observer.lost import Lost, plainly_wider
 from gsisio_jax.observer.maps import Maps
 from gsisio_jax.observer.measurement import everything_unless, in_box, inside, output_box, shift_box, typed
+from gsisio_jax.observer.past import before_all, shifted
 from gsisio_jax.observer.status import Source, Status, bit_mask
 from gsisio_jax.observer.types import Carry, Observer, StepOutput
 from gsisio_jax.plant.system import Noise
@@ -46,15 +47,16 @@ def blank(observer: Observer, initial: Interval) -> Carry:
     h = AtomBounds(jnp.zeros((atoms, n), dtype), zero, zero + jnp.inf, entire, *values)
     yes, no = jnp.asarray(True), jnp.asarray(False)
     carry = Carry(initial, h, jnp.full(l, jnp.nan, dtype), jnp.zeros(m, dtype), noise, yes, no)
-    return replace(carry, older=window.before_all(carry, observer.window, observer.system.p))
+    return replace(carry, older=before_all(carry, observer))
 
 
 @rounding.by_observer
 def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool = False) -> Any:
     """One step (theory 5). Arrays must have their final dtype.
 
-    After a conflict the recursion goes on from a box that does not contain the contradiction: y[k] and the state bounds
-    alone (restart), or the past alone, with y[k] taken as missing (`hold`).
+    After a conflict the recursion goes on from a box that does not contain the contradiction. Restart believes that the
+    state is elsewhere: y[k] and the state bounds alone, or, where these give no whole box, nothing up to k. `hold`
+    believes the past: outputs that contradict it are taken as missing.
 
     Returns:
         The next `Carry`, and a `StepOutput`.
@@ -66,8 +68,26 @@ def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold
         return after, periodic.noted(out, y, seen)
     domain, fallback, d = _contract(maps, carry, y, u, noise)
     if hold:
-        fallback, _, _ = _contract(maps, carry, jnp.full_like(y, jnp.nan), u, noise)
+        fallback, kept = _held(maps, carry, y, u, noise)
+        y = jnp.where(domain.conflict, kept, y)
     return _finish(maps, domain, fallback, carry, d, y, u, noise, hold)
+
+
+def _held(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[Domain, Any]:
+    """What the past says with those outputs that agree with it, and these; the others are NaN. Where they contradict
+    each other, none of them is used."""
+    nothing = jnp.full_like(y, jnp.nan)
+    past, _, _ = _contract(maps, carry, nothing, u, noise)
+    known = _known(maps.observer, carry, y, u, noise)
+    _, slack = contract_affine_rows(maps.states(past.box), FirstForm.of(maps.observer, u).on(past.box), known.z)
+    agrees = [slack[i] >= -past.tolerance for i in range(slack.shape[0])]
+    rows = [
+        [agrees[i] for i, outputs in enumerate(maps.observer.output_rows) if j in outputs] for j in range(y.shape[0])
+    ]
+    kept = jnp.stack([jnp.where(jnp.stack(row).all(), y[j], jnp.nan) if row else y[j] for j, row in enumerate(rows)])
+    domain, _, _ = _contract(maps, carry, kept, u, noise)
+    box = choose(domain.conflict, past.box, domain.box)
+    return past.with_box(box), jnp.where(domain.conflict, nothing, kept)
 
 
 @_stage("known")
@@ -104,6 +124,8 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         nothing = Domain.of(typed(bounds, y.dtype), size)
         alone = _output(nothing, maps.states(bounds), first.on(bounds), known.z)
         domain = nothing.intersect(everything_unless(carry.starts, before)[None], Source.INITIAL)
+        if observer.recovery is not None:
+            domain = recovery.contract(observer, domain, carry, y, u, noise)
         domain = _output(domain, maps.states(domain.box), first.on(domain.box), known.z)
         lost = Lost(observer, d_fixed)
         domain = initial_boxes(maps, domain, right, lost.inputs, u)
@@ -184,10 +206,12 @@ def _finish(
     observer, system = maps.observer, maps.observer.system
     certificate, dtype = observer.certificate, y.dtype
     conflict = domain.conflict
-    # Even the fallback may contradict itself (y[k] against the state bounds): then only the state bounds are left.
-    restart = choose(fallback.conflict, typed(system.state_bounds, dtype), fallback.box)
+    # Even the fallback may contradict itself (y[k] against the state bounds): then only the state bounds are left. So
+    # they are where it is no whole box: if y[k] is what was wrong, no later row would tell.
+    nothing = fallback.conflict if hold else fallback.conflict | ~_whole(fallback.box)
+    restart = choose(nothing, typed(system.state_bounds, dtype), fallback.box)
     state = _limited(choose(conflict, restart, domain.box))
-    believed = ~conflict if hold else ~conflict | ~fallback.conflict
+    believed = ~conflict if hold else ~conflict | ~nothing
 
     d = choose(conflict, typed(system.input_bounds, dtype), d)
     states = maps.states(state)
@@ -204,9 +228,14 @@ def _finish(
         (~(states.radius < jnp.inf).all(), Status.UNBOUNDED),
         (~applies, Status.OUTSIDE_REGION),
     )
-    older = window.shifted(carry, observer.window, d, conflict & fallback.conflict if hold else conflict)
+    older = shifted(carry, observer, d, conflict & fallback.conflict if hold else conflict)
     after = Carry(state, h, y, u, noise, jnp.asarray(False), believed, older)
     return after, StepOutput(state, d, d_now, bit_mask(bits), *domain.report())
+
+
+def _whole(box: Interval) -> Any:
+    """No side is infinite."""
+    return (jnp.isfinite(box.lower) & jnp.isfinite(box.upper)).all()
 
 
 def _limited(box: Interval) -> Interval:

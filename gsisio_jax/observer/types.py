@@ -123,6 +123,7 @@ class Observer(eqx.Module):
         sweeps: how often the box is contracted in a step.
         rounding_constants: what the gains leave by rounding.
         window: rows over several steps (`observer.window.Window`), or None.
+        recovery: rows that need no box to begin with (`observer.recovery.Recovery`), or None.
         corrections: Newton steps to the point that the certified bound is around (theory 5.6).
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
     """
@@ -149,6 +150,7 @@ class Observer(eqx.Module):
     bounds: tuple[str, ...] = eqx.field(static=True)
     sweeps: int = eqx.field(static=True)
     window: Any = None
+    recovery: Any = None
     corrections: int = eqx.field(static=True, default=0)
     rounding: Rounding = eqx.field(static=True, default="outward")
 
@@ -229,7 +231,7 @@ class Carry(eqx.Module):
         noise: bounds of w[k] and v[k].
         starts: nothing has been measured yet.
         believed: no conflict has taken y[k] out of what is believed.
-        older: the steps before, as far as windows look back (`observer.window.Past`).
+        older: the steps before, as far as rows look back (`observer.past.Past`).
     """
 
     state: Interval

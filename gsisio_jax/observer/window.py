@@ -6,7 +6,6 @@ The bounds of f and g on the boxes of these steps are kept in the carry: a windo
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -14,15 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.atoms import AtomBounds, States, wider
+from gsisio_jax.inclusion.atoms import States, wider
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, entire_like, magnitude
-from gsisio_jax.interval.image import image, loose_matvec_upper, plain_image, widened_for_sums
+from gsisio_jax.interval.box import Interval, magnitude
+from gsisio_jax.interval.image import loose_matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.interval.primitives import matmul, scale
+from gsisio_jax.observer import past
 from gsisio_jax.observer.contractors import Affine
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.lost import Lost, plainly_wider
-from gsisio_jax.observer.measurement import everything_unless, output_box, shift_box
+from gsisio_jax.observer.measurement import everything_unless, output_box
 from gsisio_jax.observer.status import Source
 from gsisio_jax.plant.system import Noise
 
@@ -70,57 +70,6 @@ class Window(eqx.Module):
         return 2 * self.length + 4
 
 
-class Past(eqx.Module):
-    """A step before the last one, as windows need it.
-
-    Attributes:
-        state: box of x, (n,).
-        h: bounds of f and g on it.
-        y, u, noise: of that step.
-        input: upper bound (p,) of |d| then.
-        believed: its measurement was.
-        trusted: no conflict since has thrown away what was known then.
-    """
-
-    state: Interval
-    h: AtomBounds
-    y: Any
-    u: Any
-    noise: Noise
-    input: Any
-    believed: Any
-    trusted: Any
-
-
-def before_all(carry: Any, window: Window | None, p: int) -> tuple[Past, ...]:
-    """What a first step has of a past: nothing that counts."""
-    if window is None:
-        return ()
-    dtype = carry.y.dtype
-    empty = Past(
-        entire_like(carry.state), _kept(carry.h), carry.y, carry.u, carry.noise, jnp.full(p, jnp.inf, dtype),
-        jnp.asarray(False), jnp.asarray(False),
-    )  # fmt: skip
-    return (empty,) * (window.length - 1)
-
-
-def shifted(carry: Any, window: Window | None, d: Interval, dropped: Any) -> tuple[Past, ...]:
-    """The past of the next step: the step before this one goes in front, unless a conflict has dropped all of it."""
-    if window is None:
-        return ()
-    found = (_last(carry, magnitude(d)), *carry.older)[: window.length - 1]
-    return tuple(replace(past, trusted=past.trusted & ~dropped) for past in found)
-
-
-def _last(carry: Any, d: Any) -> Past:
-    return Past(carry.state, _kept(carry.h), carry.y, carry.u, carry.noise, d, carry.believed, ~carry.starts)
-
-
-def _kept(h: AtomBounds) -> AtomBounds:
-    """Values at the center serve the certificate alone, which looks back one step."""
-    return replace(h, value=None, value_error=None)
-
-
 @jax.named_scope("window")
 def contract(
     maps: Any, domain: Domain, carry: Any, states: States, psi: Affine, y: Any, u: Any, noise: Noise, lost: Lost
@@ -138,23 +87,23 @@ def contract(
     """
     window, system = maps.observer.window, maps.observer.system
     n = system.n
-    pasts = (_last(carry, lost.magnitudes(domain.box)[1]), *carry.older)
+    pasts = (past.last(carry, lost.magnitudes(domain.box)[1]), *carry.older[: window.length - 1])
     total = plain_image(window.output, widened_for_sums(output_box(system, y, u, noise.v), system.l + window.terms))
     holds = jnp.ones(len(window.targets), bool)
     # Constants are widened for the sum of one row; here they go on through those of all lags.
     constants: Any = jnp.zeros(len(window.targets), y.dtype)
-    for lag, (past, count) in enumerate(zip(pasts, window.counts, strict=True)):
+    for lag, (before, count) in enumerate(zip(pasts, window.counts, strict=True)):
         multipliers = window.multipliers[lag][:count]
         # f and g jointly on the box of that step, slopes combined first; then what is known of it.
         rows = maps.rows(multipliers, window.states(lag, n)[:count])
-        found = rows.joint_box(maps.states(past.state), past.h)
+        found = rows.joint_box(maps.states(before.state), before.h)
         weights = jnp.concatenate([multipliers, window.known[lag][:count]], -1)
-        known = plain_image(weights, _known(maps.observer, past, weights.shape[-1] + window.terms))
+        known = plain_image(weights, past.known(maps.observer, before, weights.shape[-1] + window.terms))
         part = Interval.unchecked(found.lower + known.lower, found.upper + known.upper)
         total = Interval.unchecked(_added(total.lower, part.lower), _added(total.upper, part.upper))
         constants = _added(constants, abs(rows.constant))
         measured = (multipliers[:, n:] != 0).any(-1)
-        holds = jnp.concatenate([holds[:count] & past.trusted & (~measured | past.believed), holds[count:]])
+        holds = jnp.concatenate([holds[:count] & before.trusted & (~measured | before.believed), holds[count:]])
     # The part of x[k] itself, psi, on the box so far.
     slope = matmul(window.remainder, psi.slope)
     middle = matmul(slope, states.center) + matmul(window.remainder, psi.center)
@@ -166,18 +115,9 @@ def contract(
     box = Interval.unchecked(total.lower - (middle + loose), total.upper - (middle - loose))
     if rounding.outward():
         left = jnp.concatenate([window.left_x, *window.left_d], -1)
-        sizes = jnp.concatenate([magnitude(domain.box), *(past.input for past in pasts)])
+        sizes = jnp.concatenate([magnitude(domain.box), *(before.input for before in pasts)])
         box = plainly_wider(box, loose_matvec_upper(left, sizes))
-    return domain.intersect(_by_state(everything_unless(holds, box), window.targets, n), Source.STATE)
-
-
-def _known(observer: Any, past: Past, terms: int) -> Interval:
-    """[B u + w; D u + v - y] of a step, and the bounds of inputs that have them, widened for sums."""
-    system = observer.system
-    shift = shift_box(system, past.y, past.u, past.noise)
-    bounded = image(observer.bounded_inputs, system.input_bounds)
-    lower, upper = (jnp.concatenate([getattr(box, side) for box in (shift, bounded)]) for side in ("lower", "upper"))
-    return widened_for_sums(Interval.unchecked(lower, upper), terms)
+    return domain.intersect(by_state(everything_unless(holds, box), window.targets, n), Source.STATE)
 
 
 def _added(total: Any, part: Any) -> Any:
@@ -185,7 +125,7 @@ def _added(total: Any, part: Any) -> Any:
     return jnp.concatenate([total[: part.shape[0]] + part, total[part.shape[0] :]])
 
 
-def _by_state(box: Interval, targets: tuple[int, ...], n: int) -> Interval:
+def by_state(box: Interval, targets: tuple[int, ...], n: int) -> Interval:
     """Rows as boxes of all states, (K, n): a state with fewer rows repeats its last one, one without has no bound."""
     rows = [[r for r, i in enumerate(targets) if i == state] for state in range(n)]
     lower, upper = [], []

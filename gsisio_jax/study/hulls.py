@@ -10,9 +10,9 @@ import numpy as np
 
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.checks import AnyObserver, prepare
+from gsisio_jax.observer.enclosures import slopes_of
 from gsisio_jax.observer.estimation import estimate
 from gsisio_jax.observer.prediction_step import PredictionObserver
-from gsisio_jax.observer.rounding_constants import slopes_of
 from gsisio_jax.plant.system import Noise, System
 from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.study.stretch import Affine, Sides, Stretch

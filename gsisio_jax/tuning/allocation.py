@@ -26,7 +26,7 @@ from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type, read_array
-from gsisio_jax.observer.rounding_constants import slopes_of
+from gsisio_jax.observer.enclosures import slopes_of
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise, System
 

@@ -12,7 +12,7 @@ from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.gains import improve, optimal_gain, profile_gain
 from gsisio_jax.design.problem import GainProblem
-from gsisio_jax.observer.rounding_constants import slopes_of
+from gsisio_jax.observer.enclosures import slopes_of
 
 
 def problem_of(case: systems.Case) -> GainProblem:

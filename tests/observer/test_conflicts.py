@@ -47,8 +47,10 @@ def restarted(target, records):
 
 @pytest.fixture(scope="module")
 def held(target, records):
+    """Beside each record the one without those entries of row K that contradict the past."""
     missing = records.copy()
-    missing[:, K] = np.nan
+    for i, j in ((1, 0), (2, 1), (3, 0), (3, 1)):
+        missing[i, K, j] = np.nan
     est = target.run(np.concatenate([records, missing]), "hold")
     return {name: (tg.record(est, i), tg.record(est, i + len(NAMES))) for i, name in enumerate(NAMES)}
 
@@ -114,7 +116,7 @@ def test_a_measurement_that_contradicts_the_state_bounds_is_not_used(restarted, 
 
 
 @pytest.mark.parametrize("name", NAMES[1:])
-def test_hold_is_the_step_without_the_measurement(held, name):
+def test_hold_is_the_step_without_the_outputs_that_contradict_the_past(held, name):
     est, missing = held[name]
     last = K if name == "jump" else tg.STEPS  # a target that has really jumped contradicts what was held, again
     assert conflicts(est)[0] == K

@@ -1,0 +1,88 @@
+"""Rows that need no box to begin with: what y[k-N..k] alone say of x[k] (theory 5.8).
+
+After a conflict, a gap or from an unknown start the boxes are infinite, and a row whose slopes on them were cancelled
+up to rounding says nothing: 1e-17 times infinity. What rounding leaves is bounded here by the measurements themselves.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from gsisio_jax.interval import rounding
+from gsisio_jax.interval.box import Interval, magnitude
+from gsisio_jax.interval.image import plain_image, widened_for_sums
+from gsisio_jax.interval.primitives import scale
+from gsisio_jax.observer import past
+from gsisio_jax.observer.domain import Domain
+from gsisio_jax.observer.lost import plainly_wider
+from gsisio_jax.observer.measurement import everything_unless, output_box
+from gsisio_jax.observer.status import Source
+from gsisio_jax.observer.window import by_state
+from gsisio_jax.plant.system import Noise
+
+
+class Recovery(eqx.Module):
+    """R rows for single states from measurements, known inputs and noise of the last N steps; lag t is step k-1-t.
+
+        x_i in sum over t of {multipliers [B u + w; D u + v - y]}[k-1-t] + output (y - D u - v)[k] + constant
+               + sum over t of known (bounded inputs)[k-1-t]  +-  slack size
+
+    where `size` is the largest number that enters, in units of its own.
+
+    Attributes:
+        multipliers: (N, R, n + l).
+        output: (R, l); remainder: (R, q), the same on T2 y.
+        known: (N, R, b).
+        constant: boxes (R,) of what f and g have at 0.
+        slack: (R,), what the rows leave of the states and inputs of all steps, by rounding.
+        scales: (n + l,), one over the units in which equations of the plant and outputs count for `size`; 0 for those
+            that no row uses.
+        floor: (), least size: constants and bounded inputs.
+        width: (n,), of boxes from these rows alone, at the noise of the design.
+        targets: the state i of every row.
+    """
+
+    multipliers: Any
+    output: Any
+    remainder: Any
+    known: Any
+    constant: Interval
+    slack: Any
+    scales: Any
+    floor: Any
+    width: Any
+    targets: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def length(self) -> int:
+        """N, in steps."""
+        return self.multipliers.shape[0]
+
+
+@jax.named_scope("recovery")
+def contract(observer: Any, domain: Domain, carry: Any, y: Any, u: Any, noise: Noise) -> Domain:
+    """Contract the box of x[k] with every row; they hold as long as all measurements of the N steps are believed."""
+    rows, system = observer.recovery, observer.system
+    steps = (past.last(carry, None), *carry.older[: rows.length - 1])
+    terms = rows.length * rows.multipliers.shape[-1] + system.l + rows.known.shape[-1] * rows.length + 4
+    now = output_box(system, y, u, noise.v)
+    total = plain_image(rows.output, widened_for_sums(now, terms))
+    total = Interval.unchecked(total.lower + rows.constant.lower, total.upper + rows.constant.upper)
+    size = jnp.maximum(scale(rows.scales[system.n :], magnitude(now)).max(initial=0.0), rows.floor)
+    holds = jnp.asarray(True)
+    for lag, step in enumerate(steps):
+        weights = jnp.concatenate([rows.multipliers[lag], rows.known[lag]], -1)
+        seen = past.known(observer, step, terms)
+        part = plain_image(weights, seen)
+        total = Interval.unchecked(total.lower + part.lower, total.upper + part.upper)
+        size = jnp.maximum(size, scale(rows.scales, magnitude(seen)[: len(rows.scales)]).max(initial=0.0))
+        holds = holds & step.trusted & step.believed
+    if rounding.outward():
+        total = plainly_wider(total, rounding.generous(scale(rows.slack, size)))
+    # A missing measurement makes the size infinite, and then nothing is known.
+    holds = holds & (size < jnp.inf)
+    return domain.intersect(by_state(everything_unless(holds, total), rows.targets, system.n), Source.STATE)
