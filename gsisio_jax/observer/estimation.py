@@ -82,9 +82,9 @@ def estimate(
             pandas and None.
         u: known inputs (T, m), finite; needed where m > 0.
         noise: bounds at run time; None takes those of the design. Bounds of shape (T, .) change with time.
-        on_conflict: where the data contradict the bounds, go on from y[k] and the state bounds alone ("restart"), or
-            from the past alone with y[k] taken as missing ("hold"). Nothing after a conflict is certain unless the data
-            that follow are right.
+        on_conflict: where the data contradict the bounds: "restart" believes that the past was wrong and goes on from
+            y[k] and the state bounds alone (from nothing, where these give no whole box); "hold" believes the past, and
+            takes those outputs as missing that contradict it. Nothing after a conflict is certain unless that is right.
         length: number of rows of `y` that count (ragged batches); rows behind are taken as missing.
         rounding: "outward": boxes hold on the machine. "nearest": they hold up to rounding errors, and the result says
             so; for comparisons of speed. None takes that of the observer, which is "outward" by default.

@@ -1,7 +1,7 @@
 """One bad sample, a gap or an unknown start must not end the observer: boxes are finite again as soon as measurements
 determine the state at all, and certain."""
 
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -169,8 +169,9 @@ def test_rows_hold_for_inputs_and_states_of_any_size(name, dtype):
         assert ((np.asarray(box.lower) - slack <= states) & (states <= np.asarray(box.upper) + slack)).all()
 
 
-def test_single_faults(faults=2000):
-    """After the conflict a fault is in no box; before it a fault that the input explains cannot be told."""
+@pytest.mark.parametrize("faults", [2000, pytest.param(50_000, marks=pytest.mark.soak)])
+def test_single_faults(faults):
+    """Every miss lies at the fault or under a conflict, and none after it."""
     for name in ("one output", "biased outputs"):
         observer, n = designed(name), len(PLANTS[name][0])
         x, y = records(name, range(faults), 20)
@@ -178,9 +179,8 @@ def test_single_faults(faults=2000):
         at, which = rng.integers(4, 12, faults), rng.integers(y.shape[2], size=faults)
         y[np.arange(faults), at, which] += rng.choice([-1, 1], faults) * rng.uniform(50, 500, faults)
         initial = Interval.symmetric(np.full(n, 2.0))
-        est = jax.jit(jax.vmap(lambda y: gx.estimate(observer, initial, y)))(y)
-        missed = ~np.asarray(est.state.contains(x))
-        missed = missed.any(-1) if missed.ndim == 3 else missed
+        est = jax.vmap(partial(gx.estimate, observer, initial))(y)
+        missed = ~np.asarray(est.state.contains(x)).all(-1)
         conflict = (np.asarray(est.status) & gx.Status.CONFLICT) != 0
         assert conflict.any(1).all()
         runs, steps = np.nonzero(missed)
@@ -191,7 +191,7 @@ def test_single_faults(faults=2000):
 
 def test_start_and_step_keep_what_recovery_needs():
     observer = designed("chain")
-    x, y = records("chain", 2, 8)
+    _, y = records("chain", 2, 8)
     y[0, 4, 0] += 100
     est = gx.estimate(observer, Interval.entire(6), y[0])
     carry, out = gx.start(observer, Interval.entire(6), y[0, 0])
@@ -203,18 +203,17 @@ def test_start_and_step_keep_what_recovery_needs():
 
 def test_bounded_nonlinearities_count_as_noise():
     """sin(x) lies in [-1, 1] whatever x is, so affine bounds hold on all of R^n; rows from them are certain."""
-    A, G = np.array([[0.9, 0.3], [-0.3, 0.8]]), np.array([[1.0], [0.0]])
-    system = gx.System(lambda x: A @ x + 0.1 * jnp.sin(x), lambda x: x[:1], G=G, H=[[0.0]])
+    A = np.array([[0.9, 0.3], [-0.3, 0.8]])
+    system = gx.System(lambda x: A @ x + 0.1 * jnp.sin(x), lambda x: x[:1], G=np.zeros((2, 0)), H=np.zeros((1, 0)))
     noise = gx.Noise(Interval.symmetric([0.01, 0.01]), Interval.symmetric([0.05]))
     observer = gx.design_observer(system, noise, Interval.symmetric([3.0, 3.0]), certify=False)
     rng = np.random.default_rng(0)
     x, states, seen = rng.uniform(-50, 50, (200, 2)), [], []
     for _ in range(6):
-        d = rng.normal(size=(200, 1))
         states.append(x)
         seen.append(x[:, :1] + rng.uniform(-0.05, 0.05, (200, 1)))
-        x = x @ A.T + 0.1 * np.sin(x) + d @ G.T + rng.uniform(-0.01, 0.01, x.shape)
+        x = x @ A.T + 0.1 * np.sin(x) + rng.uniform(-0.01, 0.01, x.shape)
     box = jax.vmap(lambda y: gx.estimate(observer, Interval.entire(2), y).state)(np.stack(seen, 1))
     assert box.contains(np.stack(states, 1)).all()
-    assert np.isfinite(observer.certificate.recovery_steps).all() == np.isfinite(box.width[:, -1]).all()
-    print(observer.certificate, box.width[0])
+    assert observer.certificate.recovery_steps == (1, 1)
+    assert (np.asarray(box.width[:, 1]) <= np.asarray(observer.certificate.recovery_width) * (1 + 1e-6)).all()
