@@ -207,8 +207,10 @@ def _finish(
     certificate, dtype = observer.certificate, y.dtype
     conflict = domain.conflict
     # Even the fallback may contradict itself (y[k] against the state bounds): then only the state bounds are left. So
-    # they are where it is no whole box: if y[k] is what was wrong, no later row would tell.
-    nothing = fallback.conflict if hold else fallback.conflict | ~_whole(fallback.box)
+    # they are where it is no whole box and later rows give one: if y[k] is what was wrong, none of them would tell.
+    nothing = fallback.conflict
+    if observer.recovery is not None and not hold:
+        nothing = nothing | ~_whole(fallback.box)
     restart = choose(nothing, typed(system.state_bounds, dtype), fallback.box)
     state = _limited(choose(conflict, restart, domain.box))
     believed = ~conflict if hold else ~conflict | ~nothing

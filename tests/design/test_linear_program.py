@@ -8,8 +8,8 @@ import systems
 from scipy import optimize
 
 from gsisio_jax import Interval, estimate
-from gsisio_jax.design import build
 from gsisio_jax.design.linear_program import LinearProgram, diagonal
+from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 
@@ -91,4 +91,4 @@ def test_the_trial_of_a_lost_row_is_that_of_the_compiled_observer(case):
     initial = Interval(center - width / 2, center + width / 2)
     last = estimate(observer, initial, np.array(rows), np.tile(u, (len(rows), 1))).state[-1]
     finite = bool(np.isfinite(last.lower).all() and np.isfinite(last.upper).all())
-    assert build.recovers(observer, width, Interval(u, u)) is finite is observer.certificate.recoverable
+    assert with_recovery(observer, width, Interval(u, u)).recoverable is finite is observer.certificate.recoverable
