@@ -141,7 +141,7 @@ def with_constants(
     left = equations.missed(weights, N * n + np.array(found.targets), off)
     every, given = equations.determined()
     rho = equations.missed(every, np.arange(len(given)), off)
-    needed = _reached(left.any(0), rho > 0)
+    needed = _reached(np.asarray(left.any(0)), rho > 0)
     scaled = rho[needed] * equations.columns / equations.columns[needed, None]
     if not given[needed].all() or scaled.sum(1).max(initial=0.0) > 0.5:
         return None
