@@ -1,6 +1,7 @@
 """One bad sample, a gap or an unknown start must not end the observer: boxes are finite again as soon as measurements
 determine the state at all, and certain."""
 
+from fractions import Fraction
 from functools import cache, partial
 
 import jax
@@ -167,6 +168,30 @@ def test_rows_hold_for_inputs_and_states_of_any_size(name, dtype):
         # The plant itself is that of the type: its constants are off by half an ulp.
         slack = 40 * size * np.finfo(dtype).eps
         assert ((np.asarray(box.lower) - slack <= states) & (states <= np.asarray(box.upper) + slack)).all()
+
+
+@pytest.mark.parametrize("name", ["chain", "biased outputs", "random 3"])
+def test_what_rows_leave_is_bounded_by_what_is_measured(name):
+    """A run without noise in fractions, its inputs a billion: the stored row misses the state, by less than its slack
+    allows for measurements of that size."""
+    rows = designed(name).recovery
+    A, C, G, H, *_ = (np.vectorize(Fraction, otypes=[object])(part) for part in PLANTS[name])
+    exact = np.vectorize(Fraction, otypes=[object])
+    rng, N, n, missed = np.random.default_rng(4), rows.length, len(A), []
+    for _ in range(20):
+        x, seen = exact(rng.normal(size=n)), []
+        for _ in range(N + 1):
+            d = exact(1e9 * rng.normal(size=G.shape[1]))
+            seen.append(C.dot(x) + H.dot(d))
+            x, last = A.dot(x) + G.dot(d), x
+        outputs = exact(rows.multipliers[:, :, n:])
+        found = exact(rows.output).dot(seen[-1]) - sum(outputs[t].dot(seen[N - 1 - t]) for t in range(N))
+        left = [abs(found[r] - last[state]) for r, state in enumerate(rows.targets)]
+        size = max(rows.scales[n + j] * abs(float(y[j])) for y in seen for j in range(len(C)))
+        allowed = rows.slack * size
+        missed.append(np.array(left, float) / allowed)
+    assert np.max(missed) <= 1
+    assert np.max(missed) > 0  # there is something to bound
 
 
 @pytest.mark.parametrize("faults", [2000, pytest.param(50_000, marks=pytest.mark.soak)])
