@@ -1,7 +1,7 @@
 """The blocks of a Markdown page, and how they are run: one namespace and one folder for each page.
 
-A fence in Python is code; ``gsisio`` lines of a fence in ``sh`` are commands. A fence with ``title="name"`` is a file of
-that name. ``<!-- output -->`` before a ``text`` fence: every line of it must occur in what the blocks before it have
+A fence in Python is code; ``gsisio`` lines of a fence in ``sh`` are commands. A fence with ``title="name"`` is a file
+of that name. ``<!-- output -->`` before a ``text`` fence: every line of it must occur in what the blocks before it have
 said since the last such fence; ``...`` stands for anything. ``<!-- not run: why -->`` before a fence leaves it out.
 """
 
@@ -19,7 +19,9 @@ from pathlib import Path
 from gsisio_jax.cli import main
 
 ROOT = Path(__file__).parents[1]
-FENCE = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<info>[^\n]*)\n(?P<text>.*?)^```$", re.DOTALL | re.MULTILINE)
+FENCE = re.compile(
+    r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<info>[^\n]*)\n(?P<text>.*?)^```$", re.DOTALL | re.MULTILINE
+)
 PYTHON, SHELL = ("python", "py"), ("sh", "bash", "shell", "console")
 
 
@@ -73,7 +75,7 @@ def absent(expected: str, said: str) -> list[str]:
 
 @contextlib.contextmanager
 def modules_of(folder: Path) -> Iterator[None]:
-    """Modules of a page's folder can be imported, and are forgotten afterwards: another page has others by that name."""
+    """Modules of a page's folder can be imported, and are forgotten afterwards: the next page has others so named."""
     before = sys.path[:]
     sys.path.insert(0, str(folder))
     try:
@@ -111,6 +113,7 @@ class Session:
                 assert code == 0, f"{where}: gsisio {' '.join(command)} ended with {code}: {self.said.getvalue()}"
 
     def expect(self, block: Block) -> None:
-        missed = absent(block.text, self.said.getvalue())
-        assert not missed, f"{self.page.relative_to(ROOT)}, line {block.line}: not said: {missed}\n{self.said.getvalue()}"
+        said = self.said.getvalue()
+        missed = absent(block.text, said)
+        assert not missed, f"{self.page.relative_to(ROOT)}, line {block.line}: not said: {missed}\n{said}"
         self.said.truncate(self.said.seek(0))

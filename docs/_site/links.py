@@ -43,11 +43,13 @@ def on_config(config: Any) -> Any:
 
 
 def outside(source: str, target: str) -> str | None:
-    """Path in the repository of what the page `source` (a path in the repository) links to; None inside of `docs/`."""
+    """Path of the file that the page `source` links to, both from the root of the repository; None where a link holds
+    on the site as it is: an address, or from one page of `docs/` to another."""
     if re.match(r"[a-z]+:", target):
         return None
     path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
-    return path if not path.startswith("docs/") and (ROOT / path).is_file() else None
+    within = path.startswith("docs/") and source.startswith("docs/")
+    return path if not within and (ROOT / path).is_file() else None
 
 
 def place(path: str) -> str:
@@ -66,7 +68,7 @@ def on_files(files: Any, config: Any) -> Any:
     for page in list(files.documentation_pages()):
         for _, target, _ in LINK.findall(page.content_string):
             path = outside(origin(page.src_uri), target)
-            if path and place(path) not in files.src_uris:
+            if path and not path.startswith("docs/") and place(path) not in files.src_uris:
                 files.append(File.generated(config, place(path), abs_src_path=str(ROOT / path)))
     return files
 
@@ -78,9 +80,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     def moved(match: re.Match[str]) -> str:
         before, target, after = match.groups()
         path = outside(source, target)
-        if path is None and source.startswith("docs/"):
+        if path is None:
             return match.group()
-        path = path or posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
         return f"{before}{posixpath.relpath(place(path), here or '.')}{after}"
 
     return LINK.sub(moved, markdown)

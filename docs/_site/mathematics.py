@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import html as entities
 import re
+import unicodedata
 from typing import Any
 
 from latex2mathml.converter import convert
 
 INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
+# Browsers know no variants but "normal": letters of another alphabet are characters of their own.
+VARIANT = re.compile(r'<(m[in]) mathvariant="(double-struck|script|bold)">(\w)</m[in]>')
+ALPHABETS = {"double-struck": "DOUBLE-STRUCK", "script": "SCRIPT", "bold": "BOLD"}
+LETTERS = {("double-struck", "R"): "ℝ", ("script", "L"): "ℒ"}  # these stood in Unicode before the rest
 BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOTALL)
+
+
+def _letter(match: re.Match[str]) -> str:
+    tag, variant, letter = match.groups()
+    kind = "DIGIT" if letter.isdigit() else "SMALL" if letter.islower() else "CAPITAL"
+    spoken = unicodedata.name(letter).rpartition(" ")[2]
+    found = LETTERS.get((variant, letter)) or unicodedata.lookup(f"MATHEMATICAL {ALPHABETS[variant]} {kind} {spoken}")
+    return f'<{tag} mathvariant="normal">{found}</{tag}>'
 
 
 def mathml(formula: str, display: str) -> str:
@@ -18,6 +31,9 @@ def mathml(formula: str, display: str) -> str:
     unknown = re.findall(r"\\[A-Za-z]+", re.sub(r"<annotation.*?</annotation>", "", made, flags=re.DOTALL))
     if unknown:
         raise ValueError(f"formula {formula!r}: latex2mathml does not know {unknown[0]}")
+    made = VARIANT.sub(_letter, made)
+    if left := re.search(r'mathvariant="(?!normal)([a-z-]+)"', made):
+        raise ValueError(f"formula {formula!r}: no browser shows mathvariant {left[1]!r}")
     # Bars are fences here, never a relation: no space around them.
     return made.replace("<mo>&#x0007C;</mo>", '<mo fence="true" stretchy="false" lspace="0" rspace="0">|</mo>')
 
