@@ -12,6 +12,7 @@ PAGES = documents.pages()
 # Blocks that are not run, and why. A new one is a decision: it belongs here, and into a mark above its fence.
 LEFT_OUT = {
     "docs/how-to/cluster.md": 3,  # clusters of other people
+    "docs/paper.md": 1,  # has a test of its own
 }
 
 
@@ -21,10 +22,13 @@ def name(page):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
+    # Programs run once or twice each: compiled without optimization they are done in half of the time.
     before = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    jax.config.update("jax_disable_most_optimizations", True)
     monkeypatch.chdir(tmp_path)
     with documents.modules_of(tmp_path):
         yield tmp_path
+    jax.config.update("jax_disable_most_optimizations", False)
     jax.config.update("jax_enable_x64", before)
 
 
