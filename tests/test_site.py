@@ -84,7 +84,9 @@ def test_every_public_name_has_its_place_in_the_reference(site):
     modules = ("inclusion", "study", "tuning", "plot", "paper")
     parts = {f"{module}.{name}": getattr(getattr(gx, module), name) for module in modules
              for name in getattr(gx, module).__all__}  # fmt: skip
-    assert [name for name in parts if f"gsisio_jax.{name}" not in anchors] == []
+    # A function in a file of its own name is shown from there.
+    places = {name: {f"gsisio_jax.{name}", f"gsisio_jax.{name}.{name.rpartition('.')[2]}"} for name in parts}
+    assert [name for name in parts if not places[name] & anchors] == []
     # Some names stand in two places, and are shown in one of them.
     shown = {id(value) for name, value in parts.items()}
     top = [name for name in gx.__all__ if name not in (*modules, "dataset", "estimation", "examples")]
