@@ -14,6 +14,10 @@ INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
 VARIANT = re.compile(r'<(m[in]) mathvariant="(double-struck|script|bold)">(\w)</m[in]>')
 ALPHABETS = {"double-struck": "DOUBLE-STRUCK", "script": "SCRIPT", "bold": "BOLD"}
 LETTERS = {("double-struck", "R"): "ℝ", ("script", "L"): "ℒ"}  # these stood in Unicode before the rest
+# A minus after a bracket, a comma or a relation is a sign, without the space of a difference.
+SIGN = re.compile(
+    r"((?:<mo[^>]*>(?:[\[(,;]|&#x0002[8C];|&#x0005B;|&#x0003[BCDE];|&#x02264;|&#x02265;)</mo>))<mo>&#x02212;</mo>"
+)
 BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOTALL)
 
 
@@ -34,6 +38,8 @@ def mathml(formula: str, display: str) -> str:
     made = VARIANT.sub(_letter, made)
     if left := re.search(r'mathvariant="(?!normal)([a-z-]+)"', made):
         raise ValueError(f"formula {formula!r}: no browser shows mathvariant {left[1]!r}")
+    made = SIGN.sub(r'\1<mo form="prefix">&#x02212;</mo>', made)
+    made = re.sub(r"<mi>(&#x000B1;)</mi>", r"<mo>\1</mo>", made)
     # Bars are fences here, never a relation: no space around them.
     return made.replace("<mo>&#x0007C;</mo>", '<mo fence="true" stretchy="false" lspace="0" rspace="0">|</mo>')
 
