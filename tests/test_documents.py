@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 
 import documents
 import jax
@@ -51,6 +52,8 @@ def test_marks_are_known():
     """A mark with a slip of the pen would switch nothing off and check nothing."""
     marks = {block.mark for page in PAGES for block in documents.blocks(page) if block.mark}
     assert {mark for mark in marks if mark != "output" and not mark.startswith("not run: ")} <= {"test command"}
+    # An indented fence would not be seen.
+    assert [name(page) for page in PAGES if re.search(r"^[ >]+```(py|sh)", page.read_text(), re.MULTILINE)] == []
 
 
 @pytest.mark.parametrize(
