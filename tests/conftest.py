@@ -12,7 +12,7 @@ gc.set_threshold(100_000, 20, 50)
 
 
 # A file stays on one worker. These take longest; begun last (they have few tests), they would leave a core idle.
-LONGEST = ("test_containment.py", "test_tune_linear.py", "test_gradients.py", "test_readme.py", "test_missing.py",
+LONGEST = ("test_containment.py", "test_tune_linear.py", "test_gradients.py", "test_documents.py", "test_missing.py",
            "test_methods.py", "test_conflicts.py", "test_tune_scale.py")  # fmt: skip
 
 

@@ -39,13 +39,13 @@ class Abstraction(eqx.Module):
     """
 
     region: Interval
-    lower_slope: Float[Array, "*cells m n"]
-    upper_slope: Float[Array, "*cells m n"]
-    lower_offset: Float[Array, "*cells m"]
-    upper_offset: Float[Array, "*cells m"]
-    theta: Float[Array, "*cells m"]
-    sigma: Float[Array, "*cells m"]
-    gap: Float[Array, "*cells m"]
+    lower_slope: Float[Array | np.ndarray, "*cells m n"]
+    upper_slope: Float[Array | np.ndarray, "*cells m n"]
+    lower_offset: Float[Array | np.ndarray, "*cells m"]
+    upper_offset: Float[Array | np.ndarray, "*cells m"]
+    theta: Float[Array | np.ndarray, "*cells m"]
+    sigma: Float[Array | np.ndarray, "*cells m"]
+    gap: Float[Array | np.ndarray, "*cells m"]
     verified: str = eqx.field(static=True)
 
     @property

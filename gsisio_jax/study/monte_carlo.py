@@ -100,10 +100,10 @@ def monte_carlo(
 
         - ``state_coverage``, ``state_miss`` and likewise for inputs; ``first_miss`` (NaN: never);
         - ``broken_at``, ``broken``: first step (NaN: never) at which the simulation left the bounds on which the boxes
-          rely (`study.BROKEN`), as a bit mask of what;
+            rely (`study.BROKEN`), as a bit mask of what;
         - ``<name>_summary`` of every number above over the runs: see `study.summary`;
         - attribute ``missed``: runs in which a box missed the truth, with the upper end of the confidence interval of
-          their share.
+            their share.
 
     Raises:
         ContainmentLost: a box missed the truth, or a run broke its own bounds. The message says which run and step, and

@@ -160,3 +160,14 @@ def test_a_region_is_looked_for_in_vain_without_a_certificate():
         gx.design_observer(case.system, loud, "auto", missing=False)
     certificate = gx.design_observer(case.system, loud, "auto", missing=False, certify=False).certificate
     assert not certificate.self_consistent
+
+
+def test_an_affine_plant_that_drifts_runs_without_a_certificate():
+    """f is the identity, and nothing says anything of the second state: its box grows by the noise of every step."""
+    system = gx.System(lambda x: x, lambda x: x[:1], G=[[1.0], [0.0]], H=[[0.0]])
+    noise = _noise(2, 1, dw=0.125, dv=0.5)
+    observer = gx.design_observer(system, noise, region=Interval.entire(2))
+    assert not observer.certificate.certified
+    boxes = gx.estimate(observer, systems.ball([4.0, 1.0]), np.zeros((5, 1)))
+    np.testing.assert_allclose(boxes.state.width[:, 1], 2.0 + 0.25 * np.arange(5), rtol=1e-12)
+    np.testing.assert_allclose(boxes.state.width[:, 0], 1.0, rtol=1e-12)

@@ -1,0 +1,96 @@
+"""Pages that live elsewhere in the repository, and links to files outside of `docs/`.
+
+Sources link as a checkout does (``../benchmarks/README.md``). On the site some of these files are pages of their own;
+any other is copied beside the pages, so that the site is complete by itself.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[2]
+PAGES = {
+    "benchmarks/README.md": "benchmarks.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+}
+# These pages may be missing; every other entry of the navigation must be there.
+MAYBE = {"how-to/files.md", "how-to/continuous.md", "how-to/gpu.md", "examples.md"}
+LINK = re.compile(r"(\]\()([^)\s#]+)((?:#[^)\s]*)?\))")
+THEORY = re.compile(r"\btheory (\d+)(?:\.(\d+))?\b(?![^<]*</a>)")
+
+
+def prune(entries: list[Any], docs: Path) -> list[Any]:
+    """The navigation without those of MAYBE that are not there."""
+    kept = []
+    for entry in entries:
+        [(title, target)] = entry.items() if isinstance(entry, dict) else [("", entry)]
+        if isinstance(target, list):
+            kept.append({title: prune(target, docs)})
+        elif target not in MAYBE or (docs / target).exists():
+            kept.append(entry)
+    return kept
+
+
+def on_config(config: Any) -> Any:
+    config.nav = prune(config.nav, Path(config.docs_dir))
+    return config
+
+
+def outside(source: str, target: str) -> str | None:
+    """Path of the file that the page `source` links to, both from the root of the repository; None where a link holds
+    on the site as it is: an address, or from one page of `docs/` to another."""
+    if re.match(r"[a-z]+:", target):
+        return None
+    path = posixpath.normpath(posixpath.join(posixpath.dirname(source), target))
+    within = path.startswith("docs/") and source.startswith("docs/")
+    return path if not within and (ROOT / path).is_file() else None
+
+
+def place(path: str) -> str:
+    """Where a file of the repository lies on the site."""
+    return path.removeprefix("docs/") if path.startswith("docs/") else PAGES.get(path, f"files/{path}")
+
+
+def origin(uri: str) -> str:
+    """Where a page of the site lies in the repository."""
+    return {page: path for path, page in PAGES.items()}.get(uri, f"docs/{uri}")
+
+
+def on_files(files: Any, config: Any) -> Any:
+    for path, uri in PAGES.items():
+        files.append(File.generated(config, uri, content=(ROOT / path).read_text(encoding="utf-8")))
+    for page in list(files.documentation_pages()):
+        for _, target, _ in LINK.findall(page.content_string):
+            path = outside(origin(page.src_uri), target)
+            if path and not path.startswith("docs/") and place(path) not in files.src_uris:
+                files.append(File.generated(config, place(path), abs_src_path=str(ROOT / path)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    source = origin(page.file.src_uri)
+    here = posixpath.dirname(page.file.src_uri)
+
+    def moved(match: re.Match[str]) -> str:
+        before, target, after = match.groups()
+        path = outside(source, target)
+        if path is None:
+            return match.group()
+        return f"{before}{posixpath.relpath(place(path), here or '.')}{after}"
+
+    return LINK.sub(moved, markdown)
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
+    """Docstrings cite "theory N.M": a link on the pages of the reference."""
+    if not page.file.src_uri.startswith("reference/"):
+        return html
+    return THEORY.sub(
+        lambda m: f'<a href="../theory.html#theory-{"-".join(filter(None, m.groups()))}">{m.group()}</a>', html
+    )

@@ -1,0 +1,102 @@
+"""The documentation as a site: it builds without a warning, shows every formula, and needs no network."""
+
+from __future__ import annotations
+
+import logging
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+import gsisio_jax as gx
+
+ROOT = Path(__file__).parents[1]
+LOADED = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src"}
+
+
+class Page(HTMLParser):
+    """What a page loads, its anchors, its formulas, and its plain text."""
+
+    def __init__(self, path: Path):
+        super().__init__()
+        self.loads, self.anchors, self.text, self.formulas, self.open = set(), set(), [], 0, []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.formulas += tag == "math"
+        self.anchors |= {found.get("id")}
+        # A canonical address or an icon's name loads nothing.
+        if tag in LOADED and (tag != "link" or found.get("rel") in ("stylesheet", "preload", "icon", "modulepreload")):
+            self.loads.add(found.get(LOADED[tag]))
+        if tag in ("math", "code", "pre", "script", "style"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if self.open and self.open[-1] == tag:
+            self.open.pop()
+
+    def handle_data(self, data):
+        if not self.open:
+            self.text.append(data)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    from mkdocs.commands.build import build
+    from mkdocs.config import load_config
+
+    out, records = tmp_path_factory.mktemp("site"), []
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = records.append  # type: ignore[method-assign]
+    logging.getLogger("mkdocs").addHandler(handler)
+    try:
+        build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(out)))
+    finally:
+        logging.getLogger("mkdocs").removeHandler(handler)
+    assert [record.getMessage() for record in records] == []
+    return {path.relative_to(out).as_posix(): Page(path) for path in out.rglob("*.html")}
+
+
+def formulas(text: str) -> int:
+    """Formulas of a Markdown page: between dollars, outside of code."""
+    text = re.sub(r"^```.*?^```$|`[^`\n]*`", "", text, flags=re.DOTALL | re.MULTILINE)
+    display = re.findall(r"\$\$.+?\$\$", text, re.DOTALL)
+    return len(display) + len(re.findall(r"\$[^$]+\$", re.sub(r"\$\$.+?\$\$", "", text, flags=re.DOTALL)))
+
+
+def test_every_formula_is_rendered(site):
+    for source in sorted((ROOT / "docs").rglob("*.md")):
+        page = source.relative_to(ROOT / "docs").as_posix().replace("README.md", "index.md").replace(".md", ".html")
+        assert site[page].formulas >= formulas(source.read_text(encoding="utf-8")), page
+        assert not re.search(r"\\[a-z]{2,}|\$", "".join(site[page].text)), page
+    assert site["theory.html"].formulas > 800
+
+
+def test_nothing_is_loaded_from_elsewhere(site):
+    for name, page in site.items():
+        assert not [target for target in page.loads if re.match(r"(https?:)?//", target or "")], name
+
+
+def test_every_public_name_has_its_place_in_the_reference(site):
+    anchors = set().union(*(page.anchors for name, page in site.items() if name.startswith("reference/")))
+    modules = ("inclusion", "study", "tuning", "plot", "paper")
+    parts = {f"{module}.{name}": getattr(getattr(gx, module), name) for module in modules
+             for name in getattr(gx, module).__all__}  # fmt: skip
+    # A function in a file of its own name is shown from there.
+    places = {name: {f"gsisio_jax.{name}", f"gsisio_jax.{name}.{name.rpartition('.')[2]}"} for name in parts}
+    assert [name for name in parts if not places[name] & anchors] == []
+    # Some names stand in two places, and are shown in one of them.
+    shown = {id(value) for name, value in parts.items()}
+    top = [name for name in gx.__all__ if name not in (*modules, "dataset", "estimation", "examples")]
+    assert [n for n in top if f"gsisio_jax.{n}" not in anchors and id(getattr(gx, n)) not in shown] == []
+
+
+def test_sections_of_the_theory_have_the_anchors_that_docstrings_cite(site):
+    cited = set()
+    for path in (ROOT / "gsisio_jax").rglob("*.py"):
+        cited |= set(re.findall(r"\btheory (\d+(?:\.\d+)?)\b", path.read_text(encoding="utf-8")))
+    assert len(cited) > 20
+    missing = {section for section in cited if f"theory-{section.replace('.', '-')}" not in site["theory.html"].anchors}
+    assert missing == set()
