@@ -37,6 +37,7 @@ from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.recovery_constants import AffineMaps
 from gsisio_jax.observer.rounding_constants import with_rounding_constants
 from gsisio_jax.observer.types import Observer
+from gsisio_jax.observer.window_widths import WindowWidths
 from gsisio_jax.plant.system import Noise, System
 
 
@@ -159,6 +160,9 @@ def design_observer(
     if window != 1:
         rows = window_rows(problem, window, width)
         observer = replace(observer, window=rows)
+        if rows is not None and everywhere.affine:
+            widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
+            observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
     maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
     if maps is not None:
         observer = replace(observer, recovery=dead_beat_rows(problem, maps, width))

@@ -36,6 +36,7 @@ class Certificate(eqx.Module):
             state before (a start from R^n, lost rows, a conflict); ``inf``: not within n + 4 steps; () where it was not
             examined. Proved where f and g have affine bounds, else tried without noise from the centre of the region.
         recovery_width: (n,) width of the boxes then (of those at the end of the trial), at the noise of the design.
+        window: what rows over several steps make of widths (`WindowWidths`), where f and g are affine; else None.
         notes: what a reader should know besides.
         framer: the boxes are certain; False only for a prediction form that is none and was asked for all the same.
 
@@ -62,6 +63,7 @@ class Certificate(eqx.Module):
     framer: bool = eqx.field(static=True, default=True)
     recovery_steps: tuple[float, ...] = eqx.field(static=True, default=())
     recovery_width: Any = None
+    window: Any = None
 
     @property
     def rate(self) -> float:
@@ -115,7 +117,15 @@ class Certificate(eqx.Module):
         added = self.noise_width(noise)
         if not self.certified:
             return np.full(np.shape(added), np.inf)
-        return added @ np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit).T
+        settled = added @ np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit).T
+        return settled if self.window is None else self.window.settled(settled, noise)
+
+    def with_window(self, window: Any, noise: Noise) -> Certificate:
+        """The promise of the first gain and of rows over several steps (`WindowWidths`), at the noise of the design."""
+        if not self.promised:
+            return self
+        found = replace(self, window=window)
+        return replace(found, steady_width=found.widths(noise), input_width=found.input_widths(noise))
 
     def input_widths(self, noise: Noise) -> Any:
         """Steady width (p,) or (..., p) of the input boxes for other noise bounds; ``inf`` as in `widths`."""

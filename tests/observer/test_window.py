@@ -1,7 +1,7 @@
 """Windows: as tight as the exact program nearly, and certain after conflicts, gaps and in every way of running."""
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +61,27 @@ def test_widths_are_those_of_the_exact_program_nearly():
     assert np.min(ratios[4]) > 1 - 1e-6
     assert np.mean(ratios[4], 0).max() < 1.1
     assert np.mean(ratios[1], 0).max() > 1.5  # or a window would be of no use here
+
+
+def test_the_certificate_counts_the_window():
+    """The promise is that of the rows, no run exceeds it, and it scales with the noise."""
+    one, four = (rotation(window).certificate for window in (1, 4))
+    assert (four.steady_width <= one.steady_width * (1 + 1e-9)).all()
+    assert four.steady_width[1] < 0.8 * one.steady_width[1]
+    doubled = gx.Noise(Interval.symmetric(2 * W), Interval.symmetric(2 * V))
+    np.testing.assert_allclose(four.widths(doubled), 2 * four.steady_width, rtol=1e-6)
+    stacked = gx.Noise(Interval.symmetric(np.stack([W, 2 * W])), Interval.symmetric(np.stack([V, 2 * V])))
+    np.testing.assert_allclose(four.widths(stacked), np.stack([four.steady_width, 2 * four.steady_width]), rtol=1e-6)
+    rng = np.random.default_rng(7)
+    x, seen = np.zeros((200, 2)), []
+    for _ in range(40):  # at the vertices of the noise, where boxes are widest
+        seen.append(x + V * rng.choice([-1, 1], x.shape))
+        x = x @ TURN.T + W * rng.choice([-1, 1], x.shape)
+    y = np.stack(seen, 1)
+    y[0] = 0  # agrees with every state within the noise: the widest boxes of all
+    width = np.asarray(jax.vmap(partial(run, rotation(4)))(y).state.width)[:, -1]
+    assert (width <= four.steady_width * (1 + 1e-6)).all()
+    assert width.max(0)[1] > 0.9 * four.steady_width[1]
 
 
 @pytest.mark.parametrize("on_conflict", ["restart", "hold"])
