@@ -67,10 +67,13 @@ class _Program:
     def walk(self, jaxpr: Any, consts: Any, args: list[int]) -> list[int]:
         names = dict(zip(jaxpr.invars, args, strict=True))
         for var, value in zip(jaxpr.constvars, consts, strict=True):
-            names[var] = self.constant(value, var.aval.dtype)
+            names[var] = self.constant(value, np.result_type(value))
 
         def read(atom: Any) -> int:
-            return self.constant(atom.val, atom.aval.dtype) if isinstance(atom, jex.Literal) else names[atom]
+            if not isinstance(atom, jex.Literal):
+                return names[atom]
+            aval: Any = atom.aval
+            return self.constant(atom.val, aval.dtype)
 
         for equation in jaxpr.eqns:
             operands = [read(atom) for atom in equation.invars]

@@ -121,7 +121,9 @@ class Discretization:
         if len(state.shape) != 2 or state.shape[1] != n:
             raise ValueError(f"Discretization.holds: `state` must have shape (T, {n}), got {state.shape}")
         low, high = sides.sides(state)
-        good = ((low >= np.asarray(self.region.lower)) & (high <= np.asarray(self.region.upper))).all(1)
+        good: np.ndarray = np.asarray(
+            ((low >= np.asarray(self.region.lower)) & (high <= np.asarray(self.region.upper))).all(1)
+        )
         if self.u_bounds is not None:
             m = self.u_bounds.shape[0]
             values = np.zeros((0, 0)) if u is None else np.asarray(read_array("Discretization.holds", "u", u))
@@ -130,8 +132,8 @@ class Discretization:
                     f"Discretization.holds: the error depends on u; give `u` of shape ({len(good)}, {m}), got "
                     f"{'none' if u is None else values.shape}"
                 )
-            good &= np.asarray(self.u_bounds.contains(values)).all(1)
-        return np.concatenate([[True], np.logical_and.accumulate(good)[:-1]]) if len(good) else good
+            good = good & np.asarray(self.u_bounds.contains(values)).all(1)
+        return np.concatenate([[True], np.logical_and.accumulate(good)])[: len(good)]
 
 
 def _outputs(g: Callable[..., Any], n: int, m: int | None) -> int:
