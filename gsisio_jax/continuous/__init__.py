@@ -3,8 +3,8 @@
 Source: theory 15.
 """
 
-from gsisio_jax.continuous.discretize import METHODS, discretize
+from gsisio_jax.continuous.discretize import discretize
 from gsisio_jax.continuous.result import Discretization
 from gsisio_jax.continuous.state_space import from_state_space
 
-__all__ = ["METHODS", "Discretization", "discretize", "from_state_space"]
+__all__ = ["Discretization", "discretize", "from_state_space"]

@@ -139,7 +139,7 @@ class StepError:
             everything = sides.box(sides.joined(around, self.u, self.d))
             try:
                 last = inclusion.affine(self._of_z(lambda *a: self._solution(*a)[q]))(everything).range
-            except inclusion.UnknownPrimitiveError:
+            except (inclusion.UnknownPrimitiveError, NotImplementedError):  # no derivative of f to be had
                 if q > 1:
                     raise
             else:

@@ -24,6 +24,10 @@ class Field:
         self.f, self.takes_u, self.G, self.drift = f, takes_u, G, drift
         self.n, self.m, self.p = n, m, G.shape[1]
 
+    def alone(self, x: Any, u: Any) -> Any:
+        """f as it is."""
+        return maps.rate(self.f, None, x, *((u,) if self.takes_u else ()))
+
     def known(self, x: Any, u: Any) -> Any:
         """``f(x, u) + drift``."""
         return maps.rate(self.f, self.drift, x, *((u,) if self.takes_u else ()))

@@ -13,7 +13,7 @@ import numpy as np
 from gsisio_jax.continuous import sides
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type, read_array
-from gsisio_jax.plant.calls import as_vector
+from gsisio_jax.plant.calls import takes_u
 from gsisio_jax.plant.system import Noise, System
 
 
@@ -30,7 +30,7 @@ class Discretization:
         G: how the unknown input enters over a step, shape (n, p); None without one.
         dt: length of the step, in the unit of time of the vector field.
         method: as asked for.
-        region: box (n,) of states at the start of a step for which `error` holds; None without a bound.
+        region: box (n,) of states at the start of a step for which `error` holds.
         u_bounds: box (m,) of known inputs for which it holds; None where f takes none.
         input_bounds: box (p,) of unknown inputs for which it holds; None where it needs none.
     """
@@ -40,7 +40,7 @@ class Discretization:
     G: np.ndarray | None
     dt: float
     method: str
-    region: Interval | None = None
+    region: Interval
     u_bounds: Interval | None = None
     input_bounds: Interval | None = None
 
@@ -57,24 +57,13 @@ class Discretization:
         """
         m = options.pop("m", None)
         m = self.u_bounds.shape[0] if m is None and self.u_bounds is not None else m
-        n = self._size(options)
+        n = self.region.shape[0]
         G = np.zeros((n, 0)) if self.G is None else self.G
         if H is None:
             H = np.zeros((_outputs(g, n, m), G.shape[1]))
         if self.input_bounds is not None:
             options.setdefault("input_bounds", self.input_bounds)
         return System(self.f, g, G=G, H=H, m=m, **options)
-
-    def _size(self, options: dict[str, Any]) -> int:
-        if self.G is not None:
-            return self.G.shape[0]
-        for box in (self.region, options.get("state_bounds")):
-            if box is not None:
-                return box.shape[0]
-        raise ValueError(
-            "Discretization.system: the number of states is not known without a region; call "
-            "gx.System(model.f, g, G=..., H=...)"
-        )
 
     def noise(self, v: Interval, w: Interval | None = None) -> Noise:
         """Noise bounds of which the discretisation error is part of w.
@@ -96,7 +85,7 @@ class Discretization:
         check_type("Discretization.noise", "w", w, Interval, "gx.Interval.symmetric(r) is the box from -r to r")
         if w.shape[-1:] != self.error.shape:
             raise ValueError(f"Discretization.noise: `w` must have shape {self.error.shape}, got {w.shape}")
-        return Noise(sides.box(sides.add(sides.sides(self.error), sides.sides(w))), v)
+        return Noise(Interval(*sides.add(sides.sides(self.error), sides.sides(w))), v)
 
     def holds(self, state: Interval, u: Any = None) -> np.ndarray:
         """For every step of a run: is its box proved, so that the region was no assumption?
@@ -114,7 +103,7 @@ class Discretization:
         Raises:
             ValueError: there is no bound, u is missing, or a shape does not fit.
         """
-        if self.error is None or self.region is None:
+        if self.error is None:
             raise ValueError("Discretization.holds: there is no bound of the error (bound=False), so nothing is proved")
         check_type("Discretization.holds", "state", state, Interval, "give est.state")
         n = self.region.shape[0]
@@ -137,11 +126,8 @@ class Discretization:
 
 
 def _outputs(g: Callable[..., Any], n: int, m: int | None) -> int:
-    from gsisio_jax.plant.calls import takes_u
-
-    x, u = jax.ShapeDtypeStruct((n,), jnp.result_type(float)), jax.ShapeDtypeStruct((m or 0,), jnp.result_type(float))
-    out = jax.eval_shape(lambda x, u: g(x, u) if takes_u(g, "g", m)[0] else g(x), x, u)
-    size = len(out) if isinstance(out, list | tuple) else (out.shape[0] if out.shape else 1)
-    return jax.eval_shape(
-        lambda x, u: as_vector(g(x, u) if takes_u(g, "g", m)[0] else g(x), size, x.dtype), x, u
-    ).shape[0]
+    """How many numbers g returns."""
+    kind, with_u = jnp.result_type(float), takes_u(g, "g", m)[0]
+    x, u = jax.ShapeDtypeStruct((n,), kind), jax.ShapeDtypeStruct((m or 0,), kind)
+    out = jax.eval_shape(lambda x, u: g(x, u) if with_u else g(x), x, u)
+    return len(out) if isinstance(out, list | tuple) else int(np.prod(out.shape[:1]))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax.continuous import maps
-from gsisio_jax.continuous.exponential import exponential
+from gsisio_jax.continuous.hold import held
 from gsisio_jax.interval.reading import read_array
 from gsisio_jax.plant.system import System
 
@@ -136,16 +136,8 @@ def _columns(unknown: Sequence[int], m: int) -> list[int]:
     return columns
 
 
-def _held(A: np.ndarray, B: np.ndarray, G: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    n, m, p = len(A), B.shape[1], G.shape[1]
+def _held(A: np.ndarray, B: np.ndarray, G: np.ndarray, dt: float) -> list[np.ndarray]:
     h = np.asarray(read_array(_CALL, "dt", dt))
     if h.shape or not np.isfinite(h) or h <= 0:
         raise ValueError(f"{_CALL}: `dt` must be a positive number, the sampling time; got {dt!r}")
-    whole = np.zeros((n + m + p,) * 2)
-    whole[:n] = np.hstack([A, B, G])
-    try:
-        value, _ = exponential(whole, float(h))
-    except OverflowError as error:
-        raise ValueError(f"{_CALL}: dt = {dt:g} is too long for this model: {error}; give a shorter one") from None
-    A, B, G = np.split(value[:n], [n, n + m], axis=1)
-    return A, B, G
+    return held(_CALL, A, [B, G], float(h))[0]

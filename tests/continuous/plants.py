@@ -78,7 +78,13 @@ CASES = {
     "motor, hold, shaken": Case(motor, 0.1, "zoh", SWING, {"u_bounds": _box(-1, 1), **PUSHED, **SHAKEN}, most=1.5),
 }
 # Left to the soak, which takes all cases.
-SLOW = ("pendulum, Runge-Kutta", "tanks, Runge-Kutta", "pendulum, pushed, Euler", "Lorenz, Euler")
+SLOW = (
+    "pendulum, Runge-Kutta",
+    "pendulum, pushed, Taylor",
+    "tanks, Runge-Kutta",
+    "pendulum, pushed, Euler",
+    "Lorenz, Euler",
+)
 
 
 def errors(case: Case, model: gx.Discretization, count: int, seed: int = 0) -> np.ndarray:

@@ -90,6 +90,10 @@ def test_coefficients_of_float32_are_part_of_the_bound():
         fine, coarse = (gx.discretize(field, 0.1, method, region=region, dtype=t) for t in ("float64", "float32"))
         assert fine.error.upper[0] < off / 100, method
         assert off < coarse.error.upper[0] < 100 * off, method
+    with jax.enable_x64(False):  # then float32 is the type of the run, and of the boxes
+        plain = gx.discretize(field, 0.1, "euler", region=region)
+    assert plain.error.upper.dtype == np.float32
+    assert off < plain.error.upper[0] < 100 * off
 
 
 def test_an_exact_step_needs_no_bound_of_the_input():
@@ -140,8 +144,6 @@ def _half(x):
 _half.defjvp(lambda primals, tangents: (_half(*primals), 7.0 * tangents[0]))
 ONE = Interval([-1.0], [1.0])
 WRONG = {
-    "no box": (lambda: gx.discretize(plants.pendulum, 0.1), "give `region`"),
-    "no region": (lambda: gx.discretize(plants.pendulum, 0.1, G=[[0.0], [1.0]]), "a bound needs `region`"),
     "infinite region": (
         lambda: gx.discretize(plants.pendulum, 0.1, region=Interval.entire(2)),
         "`region` must be finite for a bound",
@@ -153,7 +155,7 @@ WRONG = {
     "no inputs": (lambda: gx.discretize(plants.motor, 0.1, region=SWING), "f takes u; give `u_bounds`"),
     "not affine": (
         lambda: gx.discretize(plants.pendulum, 0.1, "zoh", region=SWING),
-        r'df\[1\]/dx\[0\] lies between .* Use method="rk4"',
+        r'df\[1\]/dx\[0\] lies between .* Use method="taylor"',
     ),
     "jump": (lambda: gx.discretize(jnp.sign, 0.1, "euler", region=ONE), "f is not Lipschitz on .* without the jump"),
     "kink": (lambda: gx.discretize(plants.drag, 0.1, region=SWING), 'derivative 1 of f .* use method="euler"'),
@@ -180,7 +182,15 @@ WRONG = {
         lambda: gx.discretize(jnp.sin, 0.1, region=ONE, disturbance=Interval.entire(1)),
         "`disturbance` must be finite",
     ),
-    "shape of f": (lambda: gx.discretize(lambda x: x[:1], 0.1, region=SWING), r"must return an array of shape \(2,\)"),
+    "shape of f": (
+        lambda: gx.discretize(lambda x: x[:1], 0.1, region=SWING),
+        r"discretize: f must return an array of shape \(2,\)",
+    ),
+    "dtype": (lambda: gx.discretize(jnp.sin, 0.1, region=ONE, dtype=int), "must be a floating type"),
+    "inputs of another size": (
+        lambda: gx.discretize(plants.pendulum, 0.1, region=SWING, G=[[0.0], [1.0]], input_bounds=SWING),
+        r"`input_bounds` must be a box of shape \(1,\), got shape \(2,\)",
+    ),
     "no error": (
         lambda: gx.discretize(jnp.sin, 0.1, region=ONE, bound=False).noise(ONE),
         "there is no bound of the error",

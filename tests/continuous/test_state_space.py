@@ -78,7 +78,7 @@ WRONG = {
     "twice": (lambda: gx.from_state_space((A, B, C, D), unknown=[1, 1]), "an input twice"),
     "period": (lambda: gx.from_state_space((A, B, C, D, -1)), "positive number, or True; got -1"),
     "sampling time": (lambda: gx.from_state_space((A, B, C, D, 0), dt=0), "`dt` must be a positive number"),
-    "too long": (lambda: gx.from_state_space((A, B, C, D, 0), dt=1e6), "too long for this model"),
+    "too long": (lambda: gx.from_state_space((A, B, C, D, 0), dt=1e6), "too long for this plant"),
 }
 
 
