@@ -91,20 +91,23 @@ def bounds(boxes: int, peers: str | None) -> dict[str, Any]:
 
 
 def step(batch: int, steps: int, alone: int, peers: str | None) -> dict[str, Any]:
-    """S1 without unknown input: a step of ours for many boxes, and one of codac for `alone` records of them."""
+    """S1 without unknown input: a step of ours for many boxes, and one of codac for `alone` records of them. Ours has
+    four gains: with one alone, boxes that begin outside of its region stay wide here."""
     plant = case("s1", steps)
     none = np.zeros((2, 0))
     system = gx.System(plant.system.f, plant.system.g, G=none, H=none)
     quiet = _replaced(plant, system)
-    observer = quiet.design(missing=False)
     initial, y, x = records(quiet, batch)
-    ours, boxes = _ours(observer, initial, y)
+    programs, found = {}, {}
+    for name, gains in (("ours", 4), ("ours, one gain", 1)):
+        programs[name], boxes = _ours(quiet.design(missing=False, gains=gains), initial, y)
+        found[name] = np.asarray(boxes.lower), np.asarray(boxes.upper)
     bound = float(np.asarray(plant.noise.w.upper)[0])
     given = {"w": bound, "v": bound, "y": y[:alone], "lower": initial.lower[:alone], "upper": initial.upper[:alone]}
     with _Peers("step", peers, **given) as other:
-        seconds = _turns({"ours": ours}, other)
-    found = {"ours": tuple(np.asarray(side) for side in (boxes.lower, boxes.upper))} | other.found
-    counts = {name: (batch if name == "ours" else alone) for name in found}
+        seconds = _turns(programs, other)
+    counts = {name: (batch if name in programs else alone) for name in (*programs, *other.found)}
+    found |= other.found
     return _summary(batch, steps, seconds, counts, found, x, other.left_out("codac"))
 
 

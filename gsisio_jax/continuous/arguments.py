@@ -71,10 +71,10 @@ def read(
                             ("disturbance", disturbance, n)):  # fmt: skip
         if box is not None:
             _sized(name, box, size)
-    drift, spread = _disturbance(disturbance, n)
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
     if not jnp.issubdtype(kind, jnp.floating):
         raise ValueError(f"discretize: `dtype` must be a floating type (float64, float32), got {dtype!r}")
+    drift, spread = _disturbance(disturbance, n, kind)
     return Arguments(
         _step(dt), _order(method, order), matrix, drift, spread, sides.sides(region), _or_none(u_bounds),
         _or_none(input_bounds), float(jnp.finfo(kind).eps),
@@ -140,12 +140,12 @@ def _sized(name: str, box: Any, size: int | None = None) -> int:
     return box.shape[0]
 
 
-def _disturbance(box: Interval | None, n: int) -> tuple[np.ndarray | None, np.ndarray]:
-    """Its centre (None where it is zero) and its radius around that."""
+def _disturbance(box: Interval | None, n: int, kind: Any) -> tuple[np.ndarray | None, np.ndarray]:
+    """Its centre, a number of the type of the run (None where it is zero), and its radius around that."""
     low, high = (np.zeros(n), np.zeros(n)) if box is None else sides.sides(box)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(f"discretize: `disturbance` must be finite, got {box}; what has no bound belongs into G d")
-    center = 0.5 * low + 0.5 * high
+    center = (0.5 * low + 0.5 * high).astype(kind).astype(np.float64)
     radius = np.nextafter(np.maximum(high - center, center - low), np.inf)
     return (center if center.any() else None), np.where((low == center) & (high == center), 0, radius)
 

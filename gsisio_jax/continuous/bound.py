@@ -39,7 +39,7 @@ from gsisio_jax.continuous.exponential import integral_upper
 from gsisio_jax.continuous.field import Field
 from gsisio_jax.continuous.sides import Sides
 
-_ROUNDS, _TIGHTER = 40, 2
+_ROUNDS, _TIGHTER = 40, 3
 _INFLATION = 0.1
 
 
@@ -95,9 +95,12 @@ class StepError:
         for _ in range(_ROUNDS):
             found = moved(around)
             if sides.inside(found, around):
-                for _ in range(_TIGHTER):
-                    found = sides.meet(found, moved(found))
-                return found
+                for _ in range(_TIGHTER):  # only to boxes that pass the same test
+                    image = moved(found)
+                    if not sides.inside(image, found):
+                        break
+                    around, found = found, image
+                return around
             found = sides.hull([found, around])
             more = _INFLATION * (found[1] - found[0]) + 1e-300
             around = found[0] - more, found[1] + more
@@ -157,7 +160,11 @@ class StepError:
 
         from_zero = np.minimum(self.d[0], 0), np.maximum(self.d[1], 0)
         slopes = inclusion.jacobian(terms)(*map(sides.box, (from_zero, x, self.u)))
-        return sides.apply(sides.sides(slopes), self.d)
+        found = sides.apply(sides.sides(slopes), self.d)
+        # The powers of h are rounded, in two terms of every order.
+        sizes = inclusion.affine(self._of_z(solution))(sides.box(sides.joined(x, self.u, from_zero))).range
+        radius = np.finfo(np.float64).eps * (np.array(powers) @ sides.magnitude(sides.sides(sizes)))
+        return sides.add(found, sides.symmetric(radius * (1 + 1e-9) + 1e-300))
 
     @cached_property
     def _method(self) -> Callable[..., Any]:
