@@ -1,23 +1,15 @@
 """Other programs for the same job, in turns with this library in one run: immrax, codac, NumPy, a linear program.
 
 immrax and codac come from an environment of their own (`--peers PYTHON`), where `peers_apart.py` calls them. Each gets
-what it is made for: immrax the bounds of f and g; codac a step without unknown input; NumPy this library's own step,
-vectorised over boxes; HiGHS the exact hull of the last ten rows of a linear plant. Times are medians of turns.
+what it is made for: immrax the bounds of f and g; codac a step without unknown input; NumPy the contractors of a step
+written by hand, vectorised over boxes; HiGHS the exact hull of the last ten rows of a linear plant. Times are medians
+of turns.
 """
 
 from __future__ import annotations
 
-import importlib.util
-import json
-import os
-import subprocess
-import sys
-import tempfile
-import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -26,20 +18,16 @@ import numpy as np
 
 import gsisio_jax as gx
 from benchmarks import handwritten
+from benchmarks.peers_tools import Peers, Program, boxes_of, ours_compiled, summary_of, tiled, turns
 from benchmarks.plants import case, from_tests, records
 from benchmarks.tightness import chain
 from gsisio_jax import Interval, inclusion
 from gsisio_jax.scalar import call
 
-TILE, THREADS, ROUNDS = 2000, 2, 5
-ROUNDS_OF_BOUNDS = 40  # each takes some hundredths of a second
 TILE_OF_BOUNDS = 10_000  # of these there is less to do for a box
+ROUNDS_OF_BOUNDS = 40  # each takes some hundredths of a second
 LOOSER = 1e-6  # relative; what counts as bounds of equal width
 HORIZON = 10
-MISSING = (
-    "not installed; `python -m venv peers && peers/bin/pip install immrax codac`, then `--peers peers/bin/python` here"
-)
-Program = Callable[[], Any]
 
 
 def bounds(boxes: int, peers: str | None) -> dict[str, Any]:
@@ -59,12 +47,12 @@ def bounds(boxes: int, peers: str | None) -> dict[str, Any]:
 
         size = min(TILE_OF_BOUNDS, boxes)
         compiled = jax.jit(jax.vmap(one)).lower(lower[:size], upper[:size]).compile()
-        return _tiled(boxes, lambda tile: compiled(lower[tile], upper[tile]), size)
+        return tiled(boxes, lambda tile: compiled(lower[tile], upper[tile]), size)
 
     ours = {name: program(method) for name, method in methods.items()}
-    sides = {name: _boxes(run()) for name, run in ours.items()}
-    with _Peers("bounds", peers, lower=lower, upper=upper, tile=min(TILE_OF_BOUNDS, boxes)) as other:
-        seconds = _turns(ours, other, ROUNDS_OF_BOUNDS)
+    sides = {name: boxes_of(run()) for name, run in ours.items()}
+    with Peers("bounds", peers, lower=lower, upper=upper, tile=min(TILE_OF_BOUNDS, boxes)) as other:
+        seconds = turns(ours, other, ROUNDS_OF_BOUNDS)
         sides |= other.found
     points = rng.uniform(lower, upper)
     values = np.asarray(jax.vmap(lambda x: system.maps(x, none))(points))
@@ -100,15 +88,15 @@ def step(batch: int, steps: int, alone: int, peers: str | None) -> dict[str, Any
     initial, y, x = records(quiet, batch)
     programs, found = {}, {}
     for name, gains in (("ours", 4), ("ours, one gain", 1)):
-        programs[name], boxes = _ours(quiet.design(missing=False, gains=gains), initial, y)
+        programs[name], boxes = ours_compiled(quiet.design(missing=False, gains=gains), initial, y)
         found[name] = np.asarray(boxes.lower), np.asarray(boxes.upper)
     bound = float(np.asarray(plant.noise.w.upper)[0])
     given = {"w": bound, "v": bound, "y": y[:alone], "lower": initial.lower[:alone], "upper": initial.upper[:alone]}
-    with _Peers("step", peers, **given) as other:
-        seconds = _turns(programs, other)
+    with Peers("step", peers, **given) as other:
+        seconds = turns(programs, other)
     counts = {name: (batch if name in programs else alone) for name in (*programs, *other.found)}
     found |= other.found
-    return _summary(batch, steps, seconds, counts, found, x, other.left_out("codac"))
+    return summary_of(batch, steps, seconds, counts, found, x, other.left_out("codac"))
 
 
 def numpy(batch: int, steps: int, few: int) -> dict[str, Any]:
@@ -120,7 +108,7 @@ def numpy(batch: int, steps: int, few: int) -> dict[str, Any]:
     y, x, rng = np.asarray(run.y), np.asarray(run.x[:-1]), np.random.default_rng(0)
     below, above = (rng.uniform(0.05, 1, (batch, 2)) * plant.initial.width for _ in range(2))
     initial = Interval(x[0] - below, x[0] + above)
-    ours, boxes = _ours(observer, initial, y, shared=True)
+    ours, boxes = ours_compiled(observer, initial, y, shared=True)
     by_numpy = from_tests("oracles.numpy_program").numpy_function
 
     def wide(carry: Any) -> Any:
@@ -147,12 +135,12 @@ def numpy(batch: int, steps: int, few: int) -> dict[str, Any]:
         return kept
 
     other = np.array(loop())  # (steps - 1, n, 2, boxes)
-    seconds = _turns({"ours": ours, "NumPy": loop}, None)
+    seconds = turns({"ours": ours, "NumPy": loop}, None)
     found = {
         "ours": (boxes.lower[:, 1:], boxes.upper[:, 1:]),
         "NumPy": (other[:, :, 0].transpose(2, 0, 1), other[:, :, 1].transpose(2, 0, 1)),
     }
-    summary = _summary(batch, steps - 1, seconds, {"ours": batch, "NumPy": few}, found, x[1:], {})
+    summary = summary_of(batch, steps - 1, seconds, {"ours": batch, "NumPy": few}, found, x[1:], {})
     return {**summary, "ok": not any(summary["missed"].values())}
 
 
@@ -174,7 +162,7 @@ def horizon(batch: int, steps: int, solved: int) -> dict[str, Any]:
     start = Interval(np.tile(-plant.start, (batch, 1)), np.tile(plant.start, (batch, 1)))
     programs, found = {}, {}
     for name, observer in observers.items():
-        programs[name], boxes = _ours(observer, start, y)
+        programs[name], boxes = ours_compiled(observer, start, y)
         found[name] = (np.asarray(boxes.lower), np.asarray(boxes.upper))
     u = np.zeros((steps, 0))
     record, affine = _record(system, y[0], u, noise), affine_plant(system, u)
@@ -190,7 +178,7 @@ def horizon(batch: int, steps: int, solved: int) -> dict[str, Any]:
         return np.array([[hull.lower for hull in hulls], [hull.upper for hull in hulls]])
 
     exact = solve()
-    seconds = _turns({**programs, "HiGHS": solve}, None)
+    seconds = turns({**programs, "HiGHS": solve}, None)
     rates = {name: batch * steps / seconds[name] for name in programs} | {"HiGHS": len(chosen) / seconds["HiGHS"]}
     widths = {name: (high - low)[0, chosen].mean(0).tolist() for name, (low, high) in found.items()}
     widths["HiGHS"] = (exact[1] - exact[0]).mean(0).tolist()
@@ -209,139 +197,5 @@ def horizon(batch: int, steps: int, solved: int) -> dict[str, Any]:
     }
 
 
-def _ours(observer: gx.Observer, initial: Interval, y: np.ndarray, shared: bool = False) -> tuple[Program, Any]:
-    """A run over all boxes that keeps the last widths, and the boxes of all steps, computed apart; every box has a
-    record (boxes, T, l), or all share one (T, l)."""
-    batch = len(initial.lower)
-    size, axes = min(TILE, batch), (0, None) if shared else (0, 0)
-
-    def one(box: Interval, rows: Any, keep: Callable[[Any], Any]) -> Any:
-        return keep(gx.estimate(observer, box, rows).state)
-
-    def compiled(keep: Callable[[Any], Any]) -> Program:
-        def part(tile: slice) -> Any:
-            return jax.tree.map(lambda v: v[tile], initial), y if shared else y[tile]
-
-        program = jax.jit(jax.vmap(partial(one, keep=keep), axes)).lower(*part(slice(size))).compile()
-        return _tiled(batch, lambda tile: program(*part(tile)), size)
-
-    everything = compiled(lambda state: state)()
-    fast = compiled(lambda state: state.width[-1])
-    fast()
-    return fast, jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts]), *everything)
-
-
-def _tiled(boxes: int, run: Callable[[slice], Any], size: int) -> Program:
-    """Tiles on two threads."""
-    if boxes % size:
-        raise ValueError(f"benchmarks: {boxes} boxes are no multiple of {size}")
-    tiles = [slice(start, start + size) for start in range(0, boxes, size)]
-
-    def all_tiles() -> list[Any]:
-        with ThreadPoolExecutor(THREADS) as pool:
-            return list(pool.map(lambda tile: jax.block_until_ready(run(tile)), tiles))
-
-    return all_tiles
-
-
-def _boxes(parts: list[Any]) -> np.ndarray:
-    return np.stack(
-        [np.concatenate([np.asarray(getattr(part, side)) for part in parts]) for side in ("lower", "upper")]
-    )
-
-
 def _replaced(plant: Any, system: gx.System) -> Any:
-    from dataclasses import replace
-
     return replace(plant, system=system, d=lambda key, steps: np.zeros((steps, 0)))
-
-
-def _turns(programs: dict[str, Program], peers: _Peers | None, rounds: int = ROUNDS) -> dict[str, float]:
-    """Median seconds of each, one after the other in every round."""
-    seconds: dict[str, list[float]] = {}
-    for _ in range(rounds):
-        for name, run in programs.items():
-            started = time.perf_counter()
-            run()
-            seconds.setdefault(name, []).append(time.perf_counter() - started)
-        for name, value in peers.timed().items() if peers is not None else ():
-            seconds.setdefault(name, []).append(value)
-    return {name: float(np.median(values)) for name, values in seconds.items()}
-
-
-def _summary(
-    batch: int, steps: int, seconds: dict[str, float], counts: dict[str, int], found: dict[str, Any], x: np.ndarray,
-    left_out: dict[str, str],
-) -> dict[str, Any]:  # fmt: skip
-    rates = {name: counts[name] * steps / seconds[name] for name in found}
-    fewest = min(counts.values())
-    missed = {
-        name: int(((x[: len(low)] < low - 1e-12) | (x[: len(low)] > high + 1e-12)).sum())
-        for name, (low, high) in found.items()
-    }
-    return {
-        "batch": batch,
-        "steps": steps,
-        "seconds": seconds["ours"],
-        "rate": rates["ours"],
-        "rates": rates,
-        "ratios": {name: rates["ours"] / rate for name, rate in rates.items() if name != "ours"},
-        # Of the same records, over the second half.
-        "mean_width": {n: (h - l)[:fewest, steps // 2 :].mean((0, 1)).tolist() for n, (l, h) in found.items()},
-        "missed": missed,
-        "left_out": left_out,
-        "ok": not missed["ours"],
-    }
-
-
-class _Peers:
-    """The programs of another environment, in a process of its own.
-
-    Attributes:
-        found: the boxes of each, lower sides and upper ones.
-    """
-
-    def __init__(self, kind: str, python: str | None, **given: Any):
-        self._kind, self._python, self._given = kind, python, given
-        self.found: dict[str, np.ndarray] = {}
-        self._process: Any = None
-        self._error = ""
-
-    def __enter__(self) -> _Peers:
-        package = {"bounds": "immrax", "step": "codac"}[self._kind]
-        if self._python is None and importlib.util.find_spec(package) is None:
-            return self
-        self._folder = tempfile.TemporaryDirectory()
-        source, target = (str(Path(self._folder.name) / name) for name in ("given.npz", "found.npz"))
-        np.savez(source, **self._given)
-        # Neither this checkout nor its packages; but the same flags of XLA, which are to the advantage of both.
-        environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
-        script = str(Path(__file__).with_name("peers_apart.py"))
-        command = [self._python or sys.executable, script, self._kind, source, target]
-        pipe = subprocess.PIPE
-        self._process = subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, stderr=pipe, text=True, env=environment, cwd=self._folder.name
-        )
-        if not self._process.stdout.readline():
-            lines = self._process.communicate()[1].strip().splitlines()
-            self._error, self._process = (lines[-1] if lines else "it ended without a word"), None
-            return self
-        self.found = dict(np.load(target))
-        return self
-
-    def timed(self) -> dict[str, float]:
-        """Seconds of a run of each."""
-        if self._process is None:
-            return {}
-        print(file=self._process.stdin, flush=True)
-        return json.loads(self._process.stdout.readline())
-
-    def left_out(self, package: str) -> dict[str, str]:
-        """Why there is nothing to compare with."""
-        return {} if self.found else {package: self._error or MISSING}
-
-    def __exit__(self, *_: Any) -> None:
-        if self._process is not None:
-            self._process.communicate("")
-        if hasattr(self, "_folder"):
-            self._folder.cleanup()
