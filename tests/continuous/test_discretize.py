@@ -4,6 +4,7 @@ import pickle
 
 import jax
 import jax.numpy as jnp
+import mpmath
 import numpy as np
 import pytest
 from continuous import plants
@@ -102,6 +103,16 @@ def test_an_exact_step_needs_no_bound_of_the_input():
     assert model.input_bounds is None
     assert np.asarray(model.error.width).max() < 1e-14
     assert model.system(lambda x: x[:1]).p == 1
+
+
+@pytest.mark.parametrize(("method", "order"), [("euler", 1), ("taylor", 3), ("rk4", 4)])
+def test_the_plant_moves_on_within_a_step(method, order):
+    """``x' = x`` from 1: the remainder is that of the exponential, and larger than it would be at the start alone."""
+    h = 0.5
+    left_out = float(mpmath.exp(h) - sum(mpmath.mpf(h) ** k / mpmath.factorial(k) for k in range(order + 1)))
+    at_start = h ** (order + 1) / mpmath.factorial(order + 1)
+    model = gx.discretize(lambda x: x, h, method, region=Interval([1.0], [1.0]), order=order)
+    assert at_start < left_out <= model.error.upper[0] < 2 * left_out
 
 
 def test_kinks_are_bounded_on_both_sides():
