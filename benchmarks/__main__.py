@@ -20,12 +20,18 @@ SIZES = {  # full, quick
     "limit stored": ({"batch": 20_000, "steps": 100}, {"batch": 4_000, "steps": 50}),
     "numpy": ({"batch": 2_000, "steps": 100}, {"batch": 1_000, "steps": 20}),
     "tanks": ({"steps": 100}, {"steps": 50}),
+    "peers bounds": ({"boxes": 100_000}, {"boxes": 4_000}),
+    "peers step": ({"batch": 20_000, "steps": 60, "alone": 40}, {"batch": 2_000, "steps": 20, "alone": 5}),
+    "peers numpy": ({"batch": 20_000, "steps": 60, "few": 2_000}, {"batch": 2_000, "steps": 20, "few": 200}),
+    "peers horizon": ({"batch": 2_000, "steps": 30, "solved": 5}, {"batch": 200, "steps": 20, "solved": 2}),
     "study": ({"boxes": 1000, "levels": 1000, "steps": 100}, {"boxes": 100, "levels": 100, "steps": 50}),
     "rounding": ({"batch": 20_000, "steps": 100}, {"batch": 2_000, "steps": 50}),
 }
 
 
-def cases(quick: bool, against: str | None = None) -> dict[str, tuple[str, str, dict[str, Any]]]:
+def cases(
+    quick: bool, against: str | None = None, peers: str | None = None
+) -> dict[str, tuple[str, str, dict[str, Any]]]:
     """Name of every case: its module, its function and its arguments."""
     size = {name: both[quick] for name, both in SIZES.items()}
     return {
@@ -34,6 +40,10 @@ def cases(quick: bool, against: str | None = None) -> dict[str, tuple[str, str, 
         "throughput NumPy": ("throughput", "numpy", size["numpy"]),
         "limit final widths": ("limit", "final_widths", {**size["limit"], "against": against}),
         "limit all boxes": ("limit", "all_boxes", {**size["limit stored"], "against": against}),
+        "peers bounds": ("peers", "bounds", {**size["peers bounds"], "peers": peers}),
+        "peers step": ("peers", "step", {**size["peers step"], "peers": peers}),
+        "peers NumPy": ("peers", "numpy", size["peers numpy"]),
+        "peers horizon": ("peers", "horizon", size["peers horizon"]),
         "study sweep": ("studies", "sweep", size["study"]),
         **{
             f"rounding {plant} {dtype}": ("rounding", "compare", {"plant": plant, "dtype": dtype, **size["rounding"]})
@@ -51,15 +61,17 @@ def main() -> int:
     parser.add_argument("--only", default="", help="cases whose name contains this text")
     parser.add_argument("--name", help="name of the result file (default: quick or full)")
     parser.add_argument("--against", metavar="PYTHON", help="of an environment with an older version (limit)")
+    parser.add_argument("--peers", metavar="PYTHON", help="of an environment with immrax and codac (peers)")
     parser.add_argument("--case", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    chosen = {name: spec for name, spec in cases(options.quick, options.against).items() if options.only in name}
+    every = cases(options.quick, options.against, options.peers)
+    chosen = {name: spec for name, spec in every.items() if options.only in name}
     if options.case:
         print(json.dumps(run_here(*chosen[options.case])))
         return 0
     if not chosen:
-        parser.error(f"no case contains {options.only!r}; there are: {', '.join(cases(options.quick))}")
-    results = {name: run_apart(name, options.quick, options.against) for name in chosen}
+        parser.error(f"no case contains {options.only!r}; there are: {', '.join(every)}")
+    results = {name: run_apart(name, options.quick, options.against, options.peers) for name in chosen}
     print(table(results))
     name = options.name or ("quick" if options.quick else "full")
     RESULTS.mkdir(exist_ok=True)
@@ -77,11 +89,12 @@ def run_here(module: str, function: str, arguments: dict[str, Any]) -> dict[str,
     return measure(**arguments)
 
 
-def run_apart(name: str, quick: bool, against: str | None = None) -> dict[str, Any]:
+def run_apart(name: str, quick: bool, against: str | None = None, peers: str | None = None) -> dict[str, Any]:
     """Run one case in a process of its own."""
     print(f"{name} ...", file=sys.stderr, flush=True)
     command = [sys.executable, "-m", "benchmarks", "--case", name, *(["--quick"] if quick else [])]
     command += ["--against", against] if against else []
+    command += ["--peers", peers] if peers else []
     from gsisio_jax.scalar import options  # here: a case may measure what importing takes
 
     # As the command line of the library sets them, unless the user has; before JAX starts.

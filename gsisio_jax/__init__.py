@@ -19,6 +19,7 @@ from gsisio_jax.plant.system import Noise, System
 
 if TYPE_CHECKING:
     from gsisio_jax import dataset, examples, paper, plot, study, tuning
+    from gsisio_jax.continuous import Discretization, discretize, from_state_space
     from gsisio_jax.design import design_observer
     from gsisio_jax.study import grid, monte_carlo, sweep, tightness
     from gsisio_jax.tuning import allocate, tune_noise, width_sensitivity
@@ -28,6 +29,7 @@ __all__ = [
     "Carry",
     "Certificate",
     "ContainmentLost",
+    "Discretization",
     "Estimate",
     "FramerNotGuaranteed",
     "Interval",
@@ -43,9 +45,11 @@ __all__ = [
     "allocate",
     "dataset",
     "design_observer",
+    "discretize",
     "estimate",
     "estimation",
     "examples",
+    "from_state_space",
     "grid",
     "hull",
     "inclusion",
@@ -68,8 +72,11 @@ __all__ = [
 ]
 
 _LAZY = {
+    "Discretization": "gsisio_jax.continuous",
     "allocate": "gsisio_jax.tuning",
     "design_observer": "gsisio_jax.design",
+    "discretize": "gsisio_jax.continuous",
+    "from_state_space": "gsisio_jax.continuous",
     "grid": "gsisio_jax.study",
     "monte_carlo": "gsisio_jax.study",
     "sweep": "gsisio_jax.study",

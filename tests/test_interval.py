@@ -126,3 +126,8 @@ def test_narrowing_casts_round_outward(values):
     np.testing.assert_array_equal(traced[0][normal], down[normal])
     np.testing.assert_array_equal(traced[1][normal], up[normal])
     assert jax.grad(lambda x: cast_down(x, np.float32).sum().astype(float))(np.array([0.1])) == 1.0
+
+
+def test_a_box_is_no_array():
+    with pytest.raises(TypeError, match=r"use np.asarray\(box.lower\) and np.asarray\(box.upper\)"):
+        np.asarray(Interval([0.0], [1.0]))

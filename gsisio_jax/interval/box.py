@@ -138,6 +138,9 @@ class Interval(eqx.Module):
             "sides are box.lower and box.upper, component i is box[i]"
         )
 
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise TypeError("Interval: a box is two arrays; use np.asarray(box.lower) and np.asarray(box.upper)")
+
     def __contains__(self, value: Any) -> bool:
         raise TypeError("Interval: `x in box` would not say of which components; use box.contains(x), then .all()")
 

@@ -31,7 +31,7 @@ def check_trace(name: str, first: Any, second: Any) -> None:
     Raises:
         ValueError: one of these, with the remedy.
     """
-    random = sorted({eqn.primitive.name for eqn in _equations(first.jaxpr)}.intersection(_RANDOM))
+    random = sorted({eqn.primitive.name for eqn in equations(first.jaxpr)}.intersection(_RANDOM))
     if random:
         raise ValueError(
             f"System: {name} draws random numbers (`{random[0]}`), so it is no function of x. Noise is w and v, which "
@@ -50,11 +50,11 @@ def check_trace(name: str, first: Any, second: Any) -> None:
         )
 
 
-def _equations(jaxpr: Any) -> Iterator[Any]:
+def equations(jaxpr: Any) -> Iterator[Any]:
     for eqn in jaxpr.eqns:
         yield eqn
         for inner in _inner(eqn):
-            yield from _equations(getattr(inner, "jaxpr", inner))
+            yield from equations(getattr(inner, "jaxpr", inner))
 
 
 def _inner(eqn: Any) -> Iterator[Any]:

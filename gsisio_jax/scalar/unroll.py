@@ -98,11 +98,11 @@ def _result(graph: Graph, eqn: Any, args: list[Any], stage: str) -> Sequence[Any
     fixed = [known(arg, atom.aval.dtype) for arg, atom in zip(args, eqn.invars, strict=True)]
     if all(value is not None for value in fixed):
         with jax.ensure_compile_time_eval():
-            return [constants(np.asarray(value)) for value in _bound(eqn, fixed)]
+            return [constants(np.asarray(value)) for value in bind(eqn, fixed)]
     return _parts(graph, eqn, args)
 
 
-def _bound(eqn: Any, args: Sequence[Any]) -> Sequence[Any]:
+def bind(eqn: Any, args: Sequence[Any]) -> Sequence[Any]:
     """Results of an equation on arrays."""
     if "custom" not in eqn.primitive.name:
         out = eqn.primitive.bind(*args, **eqn.params)
@@ -165,7 +165,7 @@ class ArrayOperation:
                 else jnp.zeros(shape, atom.aval.dtype)
             )
             start += size
-        return [entry for out in _bound(self.eqn, args) for entry in jnp.ravel(out)]
+        return [entry for out in bind(self.eqn, args) for entry in jnp.ravel(out)]
 
 
 def _entries(graph: Graph, eqn: Any, args: list[Any]) -> np.ndarray:
@@ -182,7 +182,7 @@ def _entries(graph: Graph, eqn: Any, args: list[Any]) -> np.ndarray:
         value = graph.apply(name, *operands, dtype=dtype, equation=eqn, key=key)
         if isinstance(value, Number) and value.name == name and all(map(is_constant, value.operands)):
             with jax.ensure_compile_time_eval():  # a library function of constants
-                value = np.asarray(_bound(eqn, [np.asarray(v) for v in operands])[0])[()]
+                value = np.asarray(bind(eqn, [np.asarray(v) for v in operands])[0])[()]
         found.append(value)
     return collected(found, shape)
 

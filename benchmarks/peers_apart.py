@@ -1,0 +1,104 @@
+"""Run by the interpreter of an environment with immrax and codac (`peers.py`); needs nothing of this library.
+
+Arguments: "bounds" or "step", an .npz to read and one to write. It prints a line of JSON with the names of its programs
+once they are compiled and their boxes are written, then one with the seconds of a run of each for every line it reads.
+"""
+
+import json
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+THREADS = 2
+
+
+def bounds(given, target):
+    """The bounds that immrax has for f and g of the example, vmapped and compiled; `tile` boxes at a time."""
+    import immrax
+    import jax
+    import jax.numpy as jnp
+
+    lower, upper, size = given["lower"], given["upper"], int(given["tile"])
+    tiles = [slice(start, start + size) for start in range(0, len(lower), size)]
+
+    def maps(x):  # no jnp.stack: immrax has no rule for it
+        values = [
+            0.6 * x[0] - 0.12 * x[1] + 1.1 * jnp.sin(0.3 * x[1] - 0.2 * x[0]),
+            -0.2 * x[0] - 0.14 * x[1],
+            0.2 * x[0] + 0.65 * x[1] + 0.8 * jnp.sin(0.3 * x[0] + 0.2 * x[1]),
+            jnp.sin(x[0]),
+        ]
+        return jnp.concatenate([value[None] for value in values])
+
+    programs, found = {}, {}
+    for name in ("natif", "jacif", "mjacif"):
+        bounded = getattr(immrax, name)(maps)
+
+        def one(low, high, bounded=bounded):
+            return immrax.i2lu(bounded(immrax.interval(low, high)))
+
+        compiled = jax.jit(jax.vmap(one)).lower(lower[:size], upper[:size]).compile()
+
+        def run(compiled=compiled):
+            with ThreadPoolExecutor(THREADS) as pool:
+                work = [pool.submit(lambda t: jax.block_until_ready(compiled(lower[t], upper[t])), t) for t in tiles]
+                return [part.result() for part in work]
+
+        programs[name] = run
+        found[name] = np.stack([np.concatenate([np.asarray(part[side]) for part in run()]) for side in (0, 1)])
+    np.savez(target, **found)
+    return programs
+
+
+def step(given, target):
+    """Prediction by f and contraction by g, box by box, as codac's own examples write an estimator."""
+    import codac
+
+    w, v, y = float(given["w"]), float(given["v"]), given["y"]
+    x = codac.VectorVar(2)
+    f = codac.AnalyticFunction(
+        [x],
+        codac.vec(0.6 * x[0] - 0.12 * x[1] + 1.1 * codac.sin(0.3 * x[1] - 0.2 * x[0]), -0.2 * x[0] - 0.14 * x[1]),
+    )
+    g = codac.AnalyticFunction(
+        [x], codac.vec(0.2 * x[0] + 0.65 * x[1] + 0.8 * codac.sin(0.3 * x[0] + 0.2 * x[1]), codac.sin(x[0]))
+    )
+    noise = codac.IntervalVector([[-w, w], [-w, w]])
+
+    def run(keep=None):
+        for low, high, rows in zip(given["lower"], given["upper"], y, strict=True):
+            box = codac.IntervalVector([list(side) for side in zip(low, high, strict=True)])
+            for k, row in enumerate(rows):
+                if k:
+                    box = f.eval(box) + noise
+                seen = codac.IntervalVector([[value - v, value + v] for value in row])
+                contractor = codac.CtcInverse(g, seen)
+                for _ in range(3):
+                    contractor.contract(box)
+                if keep is not None:
+                    keep.append([[box[i].lb(), box[i].ub()] for i in range(2)])
+
+    kept = []
+    run(kept)
+    sides = np.array(kept).reshape(*y.shape[:2], 2, 2)
+    np.savez(target, codac=np.moveaxis(sides, -1, 0))
+    return {"codac": run}
+
+
+def main():
+    kind, source, target = sys.argv[1:]
+    programs = {"bounds": bounds, "step": step}[kind](dict(np.load(source)), target)
+    print(json.dumps(list(programs)), flush=True)
+    for _ in sys.stdin:
+        seconds = {}
+        for name, run in programs.items():
+            started = time.perf_counter()
+            run()
+            seconds[name] = time.perf_counter() - started
+        print(json.dumps(seconds), flush=True)
+
+
+if __name__ == "__main__":
+    main()
