@@ -13,7 +13,9 @@ INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
 # Browsers know no variants but "normal": letters of another alphabet are characters of their own.
 VARIANT = re.compile(r'<(m[in]) mathvariant="(double-struck|script|bold)">(\w)</m[in]>')
 ALPHABETS = {"double-struck": "DOUBLE-STRUCK", "script": "SCRIPT", "bold": "BOLD"}
-LETTERS = {("double-struck", "R"): "ℝ", ("script", "L"): "ℒ"}  # these stood in Unicode before the rest
+# These stood in Unicode before the rest.
+LETTERS = {("script", letter): found for letter, found in zip("BEFHILMR", "ℬℰℱℋℐℒℳℛ", strict=True)}
+LETTERS |= {("double-struck", letter): found for letter, found in zip("CHNPQRZ", "ℂℍℕℙℚℝℤ", strict=True)}
 # A minus after a bracket, a comma or a relation is a sign, without the space of a difference.
 SIGN = re.compile(
     r"((?:<mo[^>]*>(?:[\[(,;]|&#x0002[8C];|&#x0005B;|&#x0003[BCDE];|&#x02264;|&#x02265;)</mo>))<mo>&#x02212;</mo>"
