@@ -20,6 +20,7 @@ from gsisio_jax.plant.system import Noise, System
 if TYPE_CHECKING:
     from gsisio_jax import dataset, examples, paper, plot, study, tuning
     from gsisio_jax.design import design_observer
+    from gsisio_jax.files import load_carry, load_observer, save_carry
     from gsisio_jax.study import grid, monte_carlo, sweep, tightness
     from gsisio_jax.tuning import allocate, tune_noise, width_sensitivity
 
@@ -51,10 +52,13 @@ __all__ = [
     "inclusion",
     "intersect",
     "linear_image",
+    "load_carry",
+    "load_observer",
     "monte_carlo",
     "nearest",
     "paper",
     "plot",
+    "save_carry",
     "simulate",
     "start",
     "step",
@@ -71,7 +75,10 @@ _LAZY = {
     "allocate": "gsisio_jax.tuning",
     "design_observer": "gsisio_jax.design",
     "grid": "gsisio_jax.study",
+    "load_carry": "gsisio_jax.files",
+    "load_observer": "gsisio_jax.files",
     "monte_carlo": "gsisio_jax.study",
+    "save_carry": "gsisio_jax.files",
     "sweep": "gsisio_jax.study",
     "tightness": "gsisio_jax.study",
     "tune_noise": "gsisio_jax.tuning",
