@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.files.container import read, restore, write
+from gsisio_jax.files.once import once_per_observer
 from gsisio_jax.files.systems import described, differing_maps
 from gsisio_jax.files.tree import encode
-from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.prediction_step import PredictionObserver
@@ -41,6 +42,8 @@ def save_carry(path: str | os.PathLike[str], carry: Carry, observer: AnyObserver
     check_type(call, "observer", observer, (Observer, PredictionObserver), _OBSERVER)
     if isinstance(step, bool) or not isinstance(step, int | np.integer) or step < 0:
         raise ValueError(f"{call}: `step` must be a number of measurements, at least 0, got {step!r}")
+    if not all(map(is_concrete, jax.tree.leaves(carry))):
+        raise ValueError(f"{call}: `carry` is traced by JAX, but a file needs its numbers; save it outside of jit")
     _check_fits(call, carry, observer)
     about = {"step": int(step), "observer": digests(observer), "maps": described(observer)}
     write(call, path, "carry", about, carry)
@@ -87,17 +90,15 @@ def carried(call: str, path: Any, tree: Any, arrays: dict[str, np.ndarray], obse
     return jax.tree.map(jnp.asarray, carry)
 
 
+@once_per_observer
 def digests(observer: AnyObserver) -> dict[str, str]:
-    """What tells one observer from another but for f and g: every array, and all that is no array. Made once."""
-    if (found := vars(observer).get("_digests")) is not None:
-        return found
+    """What tells one observer from another but for f and g: every array, and all that is no array."""
     arrays: dict[str, np.ndarray] = {}
     structure = repr(encode(observer, "observer", arrays)).encode()
     found = {"structure": hashlib.blake2b(structure, digest_size=12).hexdigest()}
     for name, array in arrays.items():
         data = f"{array.dtype}{array.shape}".encode() + np.ascontiguousarray(array).tobytes()
         found[name.removeprefix("observer.")] = hashlib.blake2b(data, digest_size=12).hexdigest()
-    object.__setattr__(observer, "_digests", found)
     return found
 
 

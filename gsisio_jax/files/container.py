@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax._version import __version__
+from gsisio_jax._whole import put
 from gsisio_jax.files.tree import Node, Unknown, decode, encode
-from gsisio_jax.files.whole import put
 
 VERSION = 1
 """Of the layout; to be raised with every change of what a field of an observer or a carry means."""

@@ -5,13 +5,21 @@ from __future__ import annotations
 import os
 from typing import Any
 
+import jax
+
 from gsisio_jax.files.container import read, restore, write
 from gsisio_jax.files.systems import Compare, check_system, described
+from gsisio_jax.interval.box import is_concrete
 from gsisio_jax.plant.system import System
 
 
 def save_observer(path: str | os.PathLike[str], observer: Any) -> None:
     """What `Observer.save` does."""
+    if not all(map(is_concrete, jax.tree.leaves(observer))):
+        raise ValueError(
+            "Observer.save: the observer is traced by JAX, but a file needs its numbers; save it outside of jit, vmap "
+            "and grad"
+        )
     write("Observer.save", path, "observer", described(observer), observer)
 
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.files.once import once_per_observer
 from gsisio_jax.files.program import first_difference, points, program, values
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.plant.system import System
@@ -18,15 +19,14 @@ _TOLERANCE = {"float64": 1e-11, "float32": 1e-4}
 JAX, other machines, constants in another precision."""
 
 
+@once_per_observer  # a carry may be saved at every step
 def described(observer: Any) -> dict[str, Any]:
-    """What a file says of f and g: the programs, and values at some points of the region; JSON. Made once."""
-    if (found := vars(observer).get("_described")) is not None:
-        return found
+    """What a file says of f and g: the programs, and values at some points of the region; JSON."""
     system, region, bounds = observer.system, observer.certificate.region, observer.system.state_bounds
     x = points(*(np.clip(side, bounds.lower, bounds.upper) for side in (region.lower, region.upper)))
     u = points(observer.u_region.lower, observer.u_region.upper)
     maps = (system.dynamics, system.measurement)
-    found = {
+    return {
         "jax": jax.__version__,
         "dtype": str(jnp.result_type(float)),
         "f": program(system.dynamics, system.n, system.m),
@@ -35,8 +35,6 @@ def described(observer: Any) -> dict[str, Any]:
         "u": u.tolist(),
         "values": [_text(values(function, x, u)) for function in maps],
     }
-    object.__setattr__(observer, "_described", found)  # a carry may be saved at every step
-    return found
 
 
 def check_system(

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
 import numpy as np
-
-from gsisio_jax.interval.box import is_concrete
 
 Node = Any
 """What JSON has of a value."""
@@ -55,7 +52,6 @@ def encode(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Node:
         arrays: takes the arrays.
 
     Raises:
-        ValueError: an array is traced.
         TypeError: another class; a new part of an observer that was not added here.
     """
     if value is None or isinstance(value, bool | str):
@@ -73,8 +69,6 @@ def encode(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Node:
         return {"kind": kind, "fields": fields}
     if not hasattr(value, "dtype"):
         raise TypeError(f"{name} is of the class {kind}, which has no form in a file")
-    if not is_concrete(value):
-        raise ValueError(f"{name} is traced by JAX, but a file needs its numbers; save outside of jit, vmap and grad")
     arrays[name] = np.asarray(value)
     return {"array": name}
 
@@ -104,17 +98,6 @@ def decode(node: Node, arrays: dict[str, np.ndarray], system: Any) -> Any:
         case {"kind": str(kind), "fields": dict(fields)}:
             return _rebuilt(kind, fields, arrays, system)
     raise Unknown(f"the entry {str(node)[:60]}")
-
-
-def array_names(node: Node) -> Iterator[str]:
-    """The arrays of a node, in order."""
-    if isinstance(node, dict):
-        if "array" in node:
-            yield node["array"]
-        for part in (node.get("fields") or {}).values():
-            yield from array_names(part)
-        for part in (*node.get("tuple", ()), *node.get("list", ())):
-            yield from array_names(part)
 
 
 def _stored(kind: type) -> list[str]:

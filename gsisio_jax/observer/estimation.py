@@ -77,8 +77,8 @@ class Estimate(eqx.Module):
             labels: as in `to_xarray`; the index is the time in seconds, or the number of the step.
 
         Returns:
-            Columns ``<signal>_lower``, ``<signal>_upper`` of every state and input, ``measured_<output>`` where ``y`` is
-            given, ``status`` and ``margin``.
+            Columns ``<signal>_lower``, ``<signal>_upper`` of every state and input, ``measured_<output>`` where ``y``
+            is given, ``status`` and ``margin``.
         """
         return self.to_xarray(**labels).to_dataframe()
 

@@ -7,19 +7,20 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+_BY_VALUE = {"cloudpickle", "copy", "dill", "loky"}
+
 
 def check_named(functions: dict[str, Callable[..., Any]]) -> None:
     """Refuse to be pickled where that fails, and say how an observer gets into a file or another process.
 
-    Nothing is refused where a pickler of functions by value may be at work (cloudpickle and its copies, dill), which
-    cannot be told from pickle's own, nor for `copy`, which takes functions as they are.
+    Nothing is refused to those that take functions by value: cloudpickle and its copies in other packages, dill, copy.
+    They are known by the module that calls.
 
     Raises:
         pickle.PicklingError: a function cannot be pickled.
     """
-    if sys._getframe(2).f_globals.get("__name__") == "copy":
-        return
-    if any(name.rpartition(".")[2] in ("cloudpickle", "dill") for name in sys.modules):
+    caller = sys._getframe(2).f_globals.get("__name__") or ""
+    if not _BY_VALUE.isdisjoint(caller.split(".")):
         return
     for name, function in functions.items():
         try:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax._extras import need
-from gsisio_jax.files.whole import PART, put
+from gsisio_jax._whole import PART, put
 from gsisio_jax.study.disk import (
     create_array,
     encoded,
