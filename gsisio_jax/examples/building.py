@@ -39,9 +39,12 @@ def _g(x: Any) -> Any:
 
 
 def system() -> System:
-    """Five temperatures [degC], four of them measured; outside temperature known [degC]; unknown sun in room 1 [W]."""
-    physics = Interval(np.full(ROOMS, -20.0), np.full(ROOMS, 50.0))
-    return System(_f, _g, G=_SCALE * np.eye(ROOMS, 1), H=np.zeros((4, 1)), m=1, state_bounds=physics)
+    """Five temperatures [degC], four of them measured; outside temperature known [degC]; unknown sun in room 1
+    [W], between nothing and 3 kW, which is what four square metres of glass let in at most."""
+    return System(
+        _f, _g, G=_SCALE * np.eye(ROOMS, 1), H=np.zeros((4, 1)), m=1,
+        state_bounds=Interval(np.full(ROOMS, -20.0), np.full(ROOMS, 50.0)), input_bounds=Interval([0.0], [3000.0]),
+    )  # fmt: skip
 
 
 def noise() -> Noise:
@@ -76,6 +79,7 @@ def example() -> Example:
         known_inputs=(("outside", "degC"),),
         make_record=record,
         sample_time=STEP,
+        time_unit=("h", 3600.0),
         design={"sweeps": 1},
         shown=("room_1", "room_3", "room_4", "sun"),
     )

@@ -57,6 +57,7 @@ class Example:
         make_record: takes a seed and gives the record; a real one does not depend on it.
         design: options of `design_observer`.
         shown: names of the signals in the picture; all where empty.
+        time_unit: of the picture, and how many seconds it has.
         config: the configuration file of an example that is shipped as one, else None.
     """
 
@@ -77,6 +78,7 @@ class Example:
     sample_time: float = 1.0
     design: Mapping[str, Any] = field(default_factory=dict)
     shown: tuple[str, ...] = ()
+    time_unit: tuple[str, float] = ("s", 1.0)
     config: Path | None = None
 
     def observer(self) -> Observer:
@@ -95,12 +97,15 @@ class Example:
         return estimate(observer or self.observer(), self.initial, record.y, record.u)
 
     def dataset(self, record: Record, boxes: Estimate) -> xr.Dataset:
-        """Record and boxes under the names and units of the example, as `gsisio_jax.dataset.to_dataset` labels them."""
+        """Record and boxes under the names and units of the example (`gsisio_jax.dataset.to_dataset`)."""
         labels: dict[str, Any] = {}
         for kind, signals in (("state", self.states), ("input", self.inputs), ("output", self.outputs)):
             labels[f"{kind}_names"] = [name for name, _ in signals]
             labels[f"{kind}_units"] = [unit for _, unit in signals]
-        return boxes.to_xarray(time=record.time, y=record.y, title=self.title, **labels)
+        found = boxes.to_xarray(time=record.time, y=record.y, title=self.title, **labels)
+        unit, seconds = self.time_unit
+        found["time"] = ("time", record.time / seconds, {**found["time"].attrs, "units": unit})
+        return found
 
     def picture(self, path: str | Path, record: Record | None = None, boxes: Estimate | None = None) -> None:
         """Draw boxes, measurements and truth into a file, whose ending names the format.

@@ -64,5 +64,6 @@ def example() -> Example:
         outputs=(("tested_infected", ""), ("recovered", "")),
         make_record=record,
         sample_time=DAY,
+        time_unit=("d", DAY),
         design={"sweeps": 1, "missing": False},
     )

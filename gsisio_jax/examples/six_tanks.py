@@ -80,5 +80,5 @@ def example() -> Example:
         make_record=record,
         sample_time=STEP,
         design={"sweeps": 1, "missing": False},
-        shown=("level_1", "level_2", "level_5", "leak", "bias"),
+        shown=("level_1", "level_2", "level_5", "bias"),
     )
