@@ -42,9 +42,7 @@ def test_configuration_fits_its_system_and_data(name):
 
 def test_unknown_example():
     for call in (examples.config_path, examples.load):
-        with pytest.raises(
-            ValueError, match="no example is called 'flihgt'; there are flight, paper, double"
-        ):
+        with pytest.raises(ValueError, match="no example is called 'flihgt'; there are flight, paper, double"):
             call("flihgt")
 
 
