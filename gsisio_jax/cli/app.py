@@ -228,6 +228,7 @@ def _configuration(name: str) -> tuple[Path, Config]:
         from .. import examples
 
         if name in examples.names():
+            _use_float64()  # some records are simulated now
             path = Path(examples.config_path(name))
         elif path.is_dir():
             raise UserError(f"{name}: this is a folder; give the TOML file in it")

@@ -15,7 +15,7 @@ import numpy as np
 from .._version import __version__
 from ..files.carries import carried, digests
 from ..files.container import read, write
-from ..files.systems import described
+from ..files.program import program
 from .boxes import Boxes
 from .errors import UserError, reason
 from .problem import Problem
@@ -50,7 +50,9 @@ def identity(observer: Any, problem: Problem, on_conflict: str, chunk: int) -> s
         values = np.asarray(leaf)
         found.update(f"{values.dtype}{values.shape}".encode())
         found.update(values.tobytes())
-    found.update(repr((digests(observer), described(observer), on_conflict, chunk, __version__)).encode())
+    system = observer.system
+    maps = [program(function, system.n, system.m) for function in (system.dynamics, system.measurement)]
+    found.update(repr((digests(observer), maps, on_conflict, chunk, __version__)).encode())
     return found.hexdigest()
 
 

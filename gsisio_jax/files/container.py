@@ -62,9 +62,9 @@ def read(call: str, path: str | os.PathLike[str], kind: str) -> tuple[dict[str, 
     try:
         members = _members(data)
         header = json.loads(members.pop(_HEADER).tobytes())
-        found, version, library, about, tree = (
-            header[name] for name in ("kind", "version", "library", "about", "tree")
-        )
+        found, version, library = header["kind"], header["version"], header["library"]
+        if version == VERSION:
+            header["about"], header["tree"]
     except Exception as error:  # whatever a damaged archive makes of its readers
         why = (str(error).splitlines() or ["no reason given"])[0]
         raise ValueError(
@@ -78,7 +78,7 @@ def read(call: str, path: str | os.PathLike[str], kind: str) -> tuple[dict[str, 
             f"{call}: {target} must be of version {VERSION}, the one that gsisio_jax {__version__} reads; it is of "
             f"version {version}, written by gsisio_jax {library}; use that one, or make and save the {kind} again"
         )
-    return about, tree, members
+    return header["about"], header["tree"], members
 
 
 def restore(

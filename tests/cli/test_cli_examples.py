@@ -1,6 +1,8 @@
 """`gsisio examples`: what there is, and files to start from; and a simulated example run by its name."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -47,3 +49,11 @@ def test_a_simulated_example_runs_by_its_name(tmp_path, capsys):
     figures = json.loads(capsys.readouterr().out)
     assert (figures["steps"], figures["alarm_count"]) == (51, 0)
     assert {path.name for path in tmp_path.iterdir()} == {"tclab.nc", "tclab.csv", "tclab.png", "tclab.html"}
+
+
+def test_records_are_simulated_in_float64():
+    """Also by a command that has not yet said so to JAX: noise bounds of 1e-6 leave no room for float32."""
+    code = "from gsisio_jax.cli.app import _configuration as read; path, _ = read('battery')"
+    code += "; print((path.parent / 'battery_record.csv').read_text())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == examples.config_path("battery").with_name("battery_record.csv").read_text().split()

@@ -132,6 +132,14 @@ def test_the_same_values_are_enough_if_asked_for(saved):
         gx.load_observer(saved, changed(f=moved), compare="values")
 
 
+def test_programs_of_another_version_of_jax_are_held_against_their_values(saved, tmp_path):
+    """They look different there, so values decide."""
+    path = edited(saved, tmp_path / "older", lambda header, arrays: header["about"].update(jax="0.1.0"))
+    assert gx.load_observer(path, changed(f=rewritten)).guaranteed
+    with pytest.raises(ValueError, match="f gives"):
+        gx.load_observer(path, changed(f=moved))
+
+
 def test_a_function_made_again_is_the_same(saved):
     """Lambdas, names and lines of source do not matter."""
     assert gx.load_observer(saved, plants.bounded()).guaranteed
@@ -153,7 +161,11 @@ def fields(header):
 
 
 UNKNOWN = {
-    "newer": (lambda h, a: h.update(version=2, library="9.0"), "it is of version 2, written by gsisio_jax 9.0"),
+    "newer": (
+        lambda h, a: (h.update(version=2, library="9.0"), h.pop("tree")),
+        "it is of version 2, written by gsisio_jax 9.0",
+    ),
+    "no tree": (lambda h, a: h.pop("tree"), "it is another file, or damaged .KeyError: 'tree'"),
     "new field": (lambda h, a: fields(h).update(colour=1), "it has unknown field of Observer: colour"),
     "lost field": (lambda h, a: fields(h).pop("sweeps"), "it has missing field of Observer: sweeps"),
     "new part": (lambda h, a: fields(h).update(window={"kind": "os", "fields": {}}), "it has the part os"),
