@@ -102,11 +102,16 @@ def digests(observer: AnyObserver) -> dict[str, str]:
     return found
 
 
+@once_per_observer
+def _shapes(observer: AnyObserver) -> Carry:
+    """The carries of this observer, without numbers."""
+    side = jax.ShapeDtypeStruct((observer.system.n,), jnp.result_type(float))
+    return jax.eval_shape(lambda lower, upper: blank(observer, Interval.unchecked(lower, upper)), side, side)
+
+
 def _check_fits(call: str, carry: Carry, observer: AnyObserver) -> None:
     """Structure and shapes of what this observer hands on, batches allowed."""
-    n, dtype = observer.system.n, carry.state.dtype
-    side = jax.ShapeDtypeStruct((n,), dtype)
-    like = jax.eval_shape(lambda lower, upper: blank(observer, Interval.unchecked(lower, upper)), side, side)
+    n, like = observer.system.n, _shapes(observer)
     found, expected = jax.tree.structure(carry), jax.tree.structure(like)
     leaves = list(zip(jax.tree.leaves(carry), jax.tree.leaves(like), strict=False))
     batch = np.shape(carry.starts)
