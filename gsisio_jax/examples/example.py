@@ -14,6 +14,7 @@ from gsisio_jax.interval import Interval
 from gsisio_jax.observer.estimation import Estimate, estimate
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant import Noise, System, simulate
+from gsisio_jax.plant.periodic import nearest
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -119,7 +120,9 @@ class Example:
         record = self.record() if record is None else record
         boxes = self.estimate(record) if boxes is None else boxes
         truth: dict[str, np.ndarray] = {}
-        for signals, values in ((self.states, record.x), (self.inputs, record.d)):
+        # Of a periodic state boxes hold the truth up to a multiple of its period.
+        x = nearest(self.system, record.x, boxes.state)
+        for signals, values in ((self.states, x), (self.inputs, record.d)):
             if values is not None:
                 truth |= {name: values[:, index] for index, (name, _) in enumerate(signals)}
         save(self.dataset(record, boxes), path, self.shown or None, truth)

@@ -84,7 +84,7 @@ def carried(call: str, path: Any, tree: Any, arrays: dict[str, np.ndarray], obse
     if any(leaf.dtype == np.float64 for leaf in jax.tree.leaves(carry)) and not jax.config.read("jax_enable_x64"):
         raise ValueError(
             f"{call}: the carry in {os.fspath(path)} must be of a type that JAX has here, it is in float64; call "
-            'jax.config.update("jax_enable_x64", True) first, or begin anew with gx.start from its box of the state'
+            'jax.config.update("jax_enable_x64", True) first, or begin anew with gx.start'
         )
     _check_fits(call, carry, observer)
     return jax.tree.map(jnp.asarray, carry)

@@ -72,7 +72,10 @@ def read(call: str, path: str | os.PathLike[str], kind: str) -> tuple[dict[str, 
             f"({type(error).__name__}: {why}); save it again"
         ) from error
     if found != f"gsisio_jax.{kind}":
-        raise ValueError(f"{call}: {target} must hold a {kind}, it holds a {str(found).removeprefix('gsisio_jax.')}")
+        held = str(found).removeprefix("gsisio_jax.")
+        raise ValueError(
+            f"{call}: {target} must be the file of one {kind}, it is that of one {held}; give the right one"
+        )
     if version != VERSION:
         raise ValueError(
             f"{call}: {target} must be of version {VERSION}, the one that gsisio_jax {__version__} reads; it is of "
@@ -96,8 +99,8 @@ def restore(
             raise Unknown(f"arrays that belong to nothing: {', '.join(sorted(left)[:4])}")
     except Unknown as error:
         raise ValueError(
-            f"{call}: {Path(path)} must hold what gsisio_jax {__version__} knows as a {kind}; it has {error}; make and "
-            "save it again"
+            f"{call}: {Path(path)} must hold what gsisio_jax {__version__} knows of one {kind}; it has {error}; make "
+            "and save it again"
         ) from None
     return found
 

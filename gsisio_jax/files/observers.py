@@ -10,6 +10,7 @@ import jax
 from gsisio_jax.files.container import read, restore, write
 from gsisio_jax.files.systems import Compare, check_system, described
 from gsisio_jax.interval.box import is_concrete
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.plant.system import System
 
 
@@ -49,6 +50,10 @@ def load_observer(path: str | os.PathLike[str], system: System, compare: Compare
             another one, and what differs.
     """
     call = "load_observer"
+    check_type(call, "system", system, System)
+    if compare not in ("program", "values"):
+        raise ValueError(f'{call}: `compare` must be "program" or "values", got {compare!r}')
+    system.check_unchanged(call)
     about, tree, arrays = read(call, path, "observer")
     observer = restore(call, path, "observer", tree, arrays, system)
     check_system(call, os.fspath(path), observer.system, about, system, compare)

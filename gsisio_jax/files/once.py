@@ -17,7 +17,7 @@ def once_per_observer(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         key = id(observer)
         if key not in known:
             known[key] = function(observer)
-            weakref.finalize(observer, known.pop, key, None)
+            weakref.finalize(observer, known.pop, key, None).atexit = False
         return known[key]
 
     return remembered

@@ -46,8 +46,7 @@ def test_example(name, tmp_path):
     assert boxes.guaranteed
     assert boxes.alarms() == []
     if record.x is not None:
-        x = gx.nearest(example.system, record.x, boxes.state) if example.system.periodic_states else record.x
-        assert boxes.state.contains(x).all()
+        assert boxes.state.contains(gx.nearest(example.system, record.x, boxes.state)).all()
     assert record.d is not None
     held = np.asarray(boxes.input.contains(record.d[:-1]))[SETTLED.get(name, 0) :]
     assert held.all()

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from files import plants
@@ -10,6 +11,7 @@ from files import plants
 import gsisio_jax as gx
 from gsisio_jax import Interval
 from gsisio_jax.observer.fixed import Fixed
+from gsisio_jax.observer.scan import blank
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,7 @@ def test_many_runs_at_once(observer, tmp_path):
 def test_windows_and_the_prediction_form_keep_what_they_need(tmp_path):
     for kind, size in (("window", 2), ("prediction", 1)):
         observer = plants.design(kind)
-        first, _ = gx.start(observer, Interval.symmetric(np.ones(size)), np.zeros(size))
+        first = jax.tree.map(jnp.asarray, blank(observer, Interval.symmetric(np.ones(size))))
         gx.save_carry(tmp_path / "carry", first, observer, 1)
         assert Fixed(gx.load_carry(tmp_path / "carry", observer)[0]) == Fixed(first)
 
@@ -77,5 +79,5 @@ def test_a_carry_of_another_form_is_not_saved(observer, carry, tmp_path):
 
 def test_an_observer_is_no_carry(observer, tmp_path):
     observer.save(tmp_path / "observer")
-    with pytest.raises(ValueError, match=r"load_carry: .* must hold a carry, it holds a observer"):
+    with pytest.raises(ValueError, match=r"load_carry: .* must be the file of one carry, it is that of one observer"):
         gx.load_carry(tmp_path / "observer", observer)

@@ -173,7 +173,10 @@ UNKNOWN = {
     "more arrays": (lambda h, a: a.update(more=np.zeros(3)), "arrays that belong to nothing: more"),
     "fewer arrays": (lambda h, a: a.pop("observer.T2"), "it has the entry .*observer.T2"),
     "objects": (lambda h, a: a.update({"observer.T2": np.array([None, {}])}), "Object arrays cannot be loaded"),
-    "another kind": (lambda h, a: h.update(kind="gsisio_jax.carry"), "must hold a observer, it holds a carry"),
+    "another kind": (
+        lambda h, a: h.update(kind="gsisio_jax.carry"),
+        "must be the file of one observer, it is that of one carry",
+    ),
 }
 
 
@@ -248,6 +251,13 @@ def test_a_change_of_the_layout_needs_a_new_version():
     """What stands in a file is known by its version alone: raise `container.VERSION` with this digest."""
     fields = json.dumps(tree.layout(), sort_keys=True)
     assert (container.VERSION, hashlib.sha256(fields.encode()).hexdigest()[:16]) == (1, "9f6953fc25a0eec4")
+
+
+def test_arguments_in_the_wrong_order(saved):
+    with pytest.raises(ValueError, match=r"load_observer: `system` must be a gsisio_jax.System, got Observer"):
+        gx.load_observer(saved, plants.design("bounded"))
+    with pytest.raises(ValueError, match=r'load_observer: `compare` must be "program" or "values", got True'):
+        gx.load_observer(saved, plants.system("bounded"), compare=True)
 
 
 def test_the_file_is_plain_numpy(saved):
