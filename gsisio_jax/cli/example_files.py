@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 import textwrap
 import tomllib
 from pathlib import Path
 
 from .. import examples
+from .._whole import put
 from .errors import UserError, reason
 
 
@@ -30,11 +30,15 @@ def write_example(name: str, out: Path) -> int:
     for target in targets:
         if target.exists():
             raise UserError(f"examples: {target} is there already, and nothing is written over; give another --out")
+    written: list[Path] = []
     try:
         for target, source in targets.items():
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source, target)
+            put(target, source.read_bytes())
+            written.append(target)
     except OSError as error:
+        for target in written:
+            target.unlink()
         raise UserError(f"examples: cannot write to {out}: {reason(error)}") from error
     print(f"wrote {' and '.join(map(str, targets))}\nrun it with: gsisio estimate {out / config.name}")
     return 0

@@ -33,7 +33,8 @@ def _f(x: Any, u: Any) -> Any:
 
 
 def _g(x: Any, u: Any) -> Any:
-    return [jnp.interp(x[0], CHARGE, VOLTAGE) - x[1] - R0 * u[0], u[0]]
+    charge, voltage = (jnp.asarray(column, x.dtype) for column in (CHARGE, VOLTAGE))
+    return [jnp.interp(x[0], charge, voltage) - x[1] - R0 * u[0], u[0]]
 
 
 def system() -> System:

@@ -63,8 +63,7 @@ def read(call: str, path: str | os.PathLike[str], kind: str) -> tuple[dict[str, 
         members = _members(data)
         header = json.loads(members.pop(_HEADER).tobytes())
         found, version, library = header["kind"], header["version"], header["library"]
-        if version == VERSION:
-            header["about"], header["tree"]
+        about, tree = (header["about"], header["tree"]) if version == VERSION else ({}, None)
     except Exception as error:  # whatever a damaged archive makes of its readers
         why = (str(error).splitlines() or ["no reason given"])[0]
         raise ValueError(
@@ -81,7 +80,7 @@ def read(call: str, path: str | os.PathLike[str], kind: str) -> tuple[dict[str, 
             f"{call}: {target} must be of version {VERSION}, the one that gsisio_jax {__version__} reads; it is of "
             f"version {version}, written by gsisio_jax {library}; use that one, or make and save the {kind} again"
         )
-    return header["about"], header["tree"], members
+    return about, tree, members
 
 
 def restore(
