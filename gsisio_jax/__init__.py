@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gsisio_jax import dataset, examples, paper, plot, study, tuning
     from gsisio_jax.continuous import Discretization, discretize, from_state_space
     from gsisio_jax.design import design_observer
+    from gsisio_jax.files import load_carry, load_observer, save_carry
     from gsisio_jax.study import grid, monte_carlo, sweep, tightness
     from gsisio_jax.tuning import allocate, tune_noise, width_sensitivity
 
@@ -55,10 +56,13 @@ __all__ = [
     "inclusion",
     "intersect",
     "linear_image",
+    "load_carry",
+    "load_observer",
     "monte_carlo",
     "nearest",
     "paper",
     "plot",
+    "save_carry",
     "simulate",
     "start",
     "step",
@@ -78,7 +82,10 @@ _LAZY = {
     "discretize": "gsisio_jax.continuous",
     "from_state_space": "gsisio_jax.continuous",
     "grid": "gsisio_jax.study",
+    "load_carry": "gsisio_jax.files",
+    "load_observer": "gsisio_jax.files",
     "monte_carlo": "gsisio_jax.study",
+    "save_carry": "gsisio_jax.files",
     "sweep": "gsisio_jax.study",
     "tightness": "gsisio_jax.study",
     "tune_noise": "gsisio_jax.tuning",

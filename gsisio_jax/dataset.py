@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ def to_dataset(
     est: Any,
     *,
     time: Any = None,
+    dt: float | None = None,
     state_names: Sequence[str] | None = None,
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
@@ -35,7 +37,9 @@ def to_dataset(
 
     Args:
         est: result of `estimate` on one record (no batch axis): T steps, n states, p unknown inputs.
-        time: shape (T,), seconds; the step number where it is left out.
+        time: shape (T,), seconds.
+        dt: seconds between two steps, in the place of `time`: the first step is at 0 s. With neither, the time is the
+            number of the step.
         state_names: n names; ``x1, x2, ...`` where left out. Likewise `input_names` (``d1, ...``) and `output_names`
             (``y1, ...``).
         state_units: n units; no unit where left out. Likewise `input_units` and `output_units`.
@@ -64,7 +68,7 @@ def to_dataset(
         )
     steps, n = state_shape
     p = np.shape(est.input.lower)[-1]
-    time, time_attributes = _time(time, steps)
+    time, time_attributes = _time(time, dt, steps)
     state_names, state_units = _labels("state", state_names, state_units, n, "x")
     input_names, input_units = _labels("input", input_names, input_units, p, "d")
     variables: dict[str, Any] = {}
@@ -132,7 +136,13 @@ def alarm_records(est: Any, time: Any, **labels: Any) -> list[dict[str, Any]]:
     ]
 
 
-def _time(time: Any, steps: int) -> tuple[np.ndarray, dict[str, str]]:
+def _time(time: Any, dt: float | None, steps: int) -> tuple[np.ndarray, dict[str, str]]:
+    if dt is not None:
+        if time is not None:
+            raise ValueError("to_dataset: give either `time` or `dt`, got both; `dt` is for steps of one length")
+        if not (isinstance(dt, Real) and 0 < dt < np.inf):
+            raise ValueError(f"to_dataset: `dt` must be a number of seconds above 0, got {dt!r}")
+        time = float(dt) * np.arange(steps)
     if time is None:
         return np.arange(steps, dtype=np.float64), {"long_name": "step"}
     time = np.asarray(read_array("to_dataset", "time", time), dtype=np.float64)

@@ -19,27 +19,8 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }
-# These pages may be missing; every other entry of the navigation must be there.
-MAYBE = {"how-to/files.md", "how-to/continuous.md", "how-to/gpu.md", "examples.md"}
 LINK = re.compile(r"(\]\()([^)\s#]+)((?:#[^)\s]*)?\))")
 THEORY = re.compile(r"\btheory (\d+)(?:\.(\d+))?\b(?![^<]*</a>)")
-
-
-def prune(entries: list[Any], docs: Path) -> list[Any]:
-    """The navigation without those of MAYBE that are not there."""
-    kept = []
-    for entry in entries:
-        [(title, target)] = entry.items() if isinstance(entry, dict) else [("", entry)]
-        if isinstance(target, list):
-            kept.append({title: prune(target, docs)})
-        elif target not in MAYBE or (docs / target).exists():
-            kept.append(entry)
-    return kept
-
-
-def on_config(config: Any) -> Any:
-    config.nav = prune(config.nav, Path(config.docs_dir))
-    return config
 
 
 def outside(source: str, target: str) -> str | None:

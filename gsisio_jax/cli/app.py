@@ -88,6 +88,14 @@ def _parser() -> argparse.ArgumentParser:
     design.add_argument("--format", choices=("text", "json"), default="text", help="of the certificate")
     design.set_defaults(command=_design)
 
+    examples = commands.add_parser(
+        "examples", help="list the built-in examples, or write one out to start from", **layout
+    )
+    examples.add_argument("name", metavar="NAME", nargs="?", help="the example to write; left out: list all of them")
+    examples.add_argument("--out", metavar="DIR", type=Path, help="folder of its files (default: here)")
+    examples.add_argument("--debug", action="store_true", help="show the full traceback of every error")
+    examples.set_defaults(command=_examples)
+
     init = commands.add_parser(
         "init", help="write a configuration and a plant to fill in, for a table", epilog=INIT, formatter_class=form
     )
@@ -176,6 +184,17 @@ def _init(options: argparse.Namespace) -> int:
     return init(Path(options.table), options.out)
 
 
+def _examples(options: argparse.Namespace) -> int:
+    from .example_files import list_examples, write_example
+
+    if options.name is None:
+        if options.out is not None:
+            raise UserError("examples: --out needs the NAME of the example to write")
+        return list_examples()
+    _use_float64()
+    return write_example(options.name, options.out or Path())
+
+
 def _sweep(options: argparse.Namespace) -> int:
     path, config = _configuration(options.config)
     from .study import sweep
@@ -209,6 +228,7 @@ def _configuration(name: str) -> tuple[Path, Config]:
         from .. import examples
 
         if name in examples.names():
+            _use_float64()  # some records are simulated now
             path = Path(examples.config_path(name))
         elif path.is_dir():
             raise UserError(f"{name}: this is a folder; give the TOML file in it")

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import inspect
-import io
 import shutil
 import time
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +13,15 @@ import jax
 import numpy as np
 
 from .._version import __version__
-from ..study.disk import put
+from ..files.carries import carried, digests
+from ..files.container import read, write
+from ..files.program import program
 from .boxes import Boxes
 from .errors import UserError, reason
 from .problem import Problem
 
-VERSION = 1
 EVERY = 5.0  # seconds from one to the next
+_KIND = "checkpoint"
 
 
 class Digest:
@@ -43,25 +42,17 @@ class Digest:
 def identity(observer: Any, problem: Problem, on_conflict: str, chunk: int) -> str:
     """What two runs must share for one to go on where the other stopped.
 
-    All numbers of the observer and of the initial box, the source files of f and g, what the configuration hands to the
-    function that makes the system, and the version of the library. A number that f takes from a third file is not seen,
-    unless the design depends on it.
+    All numbers of the observer and of the initial box, the programs of f and g, how the rows are cut, and the version
+    of the library.
     """
     found = hashlib.blake2b(digest_size=16)
-    for leaf in jax.tree.leaves((observer, problem.initial)):
+    for leaf in jax.tree.leaves(problem.initial):
         values = np.asarray(leaf)
         found.update(f"{values.dtype}{values.shape}".encode())
         found.update(values.tobytes())
-    files = set()
-    for function in (observer.system.f, observer.system.g):
-        try:
-            files.add(inspect.getsourcefile(inspect.unwrap(function)))
-        except TypeError:
-            continue
-    for file in sorted(filter(None, files)):
-        if Path(file).is_file():
-            found.update(Path(file).read_bytes())
-    found.update(repr((on_conflict, chunk, problem.arguments, __version__, VERSION)).encode())
+    system = observer.system
+    maps = [program(function, system.n, system.m) for function in (system.dynamics, system.measurement)]
+    found.update(repr((digests(observer), maps, on_conflict, chunk, __version__)).encode())
     return found.hexdigest()
 
 
@@ -106,19 +97,16 @@ class Checkpoint:
     def save(self, boxes: Boxes, carry: Any, identity: str, digest: Digest) -> None:
         """Rows first, then what refers to them; each whole or not at all."""
         boxes.sync()
-        leaves = [np.asarray(leaf) for leaf in jax.device_get(jax.tree.leaves(carry))]
-        named: dict[str, Any] = {f"carry_{index}": leaf for index, leaf in enumerate(leaves)}
-        stream = io.BytesIO()
-        np.savez(stream, rows=len(boxes), identity=identity, digest=str(digest), **named)
-        put(self.file, stream.getvalue())
+        about = {"rows": len(boxes), "identity": identity, "digest": str(digest)}
+        write("--resume", self.file, _KIND, about, jax.device_get(carry))
         self.rows, self._last = len(boxes), time.monotonic()
 
-    def load(self, identity: str, like: Any) -> tuple[Any, int, str] | None:
+    def load(self, identity: str, observer: Any) -> tuple[Any, int, str] | None:
         """The carry, the number of rows and their digest; None where there is nothing to go on from.
 
         Args:
             identity: of this run.
-            like: a carry of this observer.
+            observer: which takes the carry.
 
         Raises:
             UserError: what is there belongs to another run, or cannot be read.
@@ -126,20 +114,18 @@ class Checkpoint:
         if not self.file.is_file():
             return None
         try:
-            with np.load(self.file, allow_pickle=False) as found:
-                stored = {name: found[name] for name in found.files}
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            about, tree, arrays = read("--resume", self.file, _KIND)
+        except (OSError, ValueError) as error:
             raise UserError(f"--resume: cannot read {self.file}: {reason(error)}; begin anew without it") from error
-        if str(stored.get("identity")) != identity:
+        if about["identity"] != identity:
             raise UserError(
                 f"--resume: the interrupted run in {self.folder} had another plant, noise, initial box, design or "
                 "version of this library; begin anew without --resume"
             )
         self._hold()
-        leaves, tree = jax.tree.flatten(like)
-        found = [jax.numpy.asarray(stored[f"carry_{index}"]) for index in range(len(leaves))]
-        self.rows = int(stored["rows"])
-        return jax.tree.unflatten(tree, found), self.rows, str(stored["digest"])
+        carry = carried("--resume", self.file, tree, arrays, observer, _KIND)
+        self.rows = about["rows"]
+        return carry, self.rows, about["digest"]
 
     def leave(self) -> None:
         """The run has failed or was stopped: what helps no other run goes."""

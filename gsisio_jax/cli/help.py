@@ -5,6 +5,8 @@ from __future__ import annotations
 EXAMPLES = """\
 examples:
   gsisio estimate flight                     a built-in example; files go to results/flight
+  gsisio examples                            what there is besides, and what it teaches
+  gsisio examples battery --out mine         its configuration and record, to start from
   gsisio init pump.csv                       a configuration and a plant to fill in, for a log
   gsisio estimate pump.toml --out today      your own system and table
   gsisio estimate pump.toml friday.csv       the same with another table

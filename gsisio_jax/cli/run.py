@@ -124,7 +124,7 @@ class _Runner:
         u0 = None if row.u is None else row.u[0]
         carry, out = gx.start(self.observer, self.problem.initial, row.y[0], u0=u0, on_conflict=self.on_conflict)
         self.carry = carry
-        found = self.checkpoint.load(self.identity, carry) if self.checkpoint is not None and resume else None
+        found = self.checkpoint.load(self.identity, self.observer) if self.checkpoint is not None and resume else None
         if found is not None and self.checkpoint is not None:
             self.carry, self.resumed, self._stored = found
             self.boxes.reopen(self.checkpoint.boxes, self.resumed)

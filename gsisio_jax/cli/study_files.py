@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..study.disk import PART
+from .._whole import PART
 from ..study.reader import for_netcdf
 from ..study.store import TileStore
 from .errors import UserError, reason

@@ -59,6 +59,29 @@ class Estimate(eqx.Module):
         """
         return read_alarms(self.status, self.margin, self.source, self.output_rows)
 
+    def to_xarray(self, **labels: Any) -> Any:
+        """The boxes as an ``xarray.Dataset`` over time, with names and units: `gsisio_jax.dataset.to_dataset`.
+
+        Args:
+            labels: of `to_dataset`: ``time`` or ``dt`` [s], ``state_names``, ``input_names``, ``output_names``, units
+                likewise, the measurements ``y``, ``title``, ``certificate``.
+        """
+        from gsisio_jax.dataset import to_dataset
+
+        return to_dataset(self, **labels)
+
+    def to_pandas(self, **labels: Any) -> Any:
+        """The boxes as a ``pandas.DataFrame``, one row a step: the variables of `to_xarray` as columns.
+
+        Args:
+            labels: as in `to_xarray`; the index is the time in seconds, or the number of the step.
+
+        Returns:
+            Columns ``<signal>_lower``, ``<signal>_upper`` of every state and input, ``measured_<output>`` where ``y``
+            is given, ``status`` and ``margin``.
+        """
+        return self.to_xarray(**labels).to_dataframe()
+
 
 def estimate(
     observer: AnyObserver,

@@ -7,6 +7,7 @@ sorted corners.
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -78,6 +79,12 @@ class PredictionObserver(eqx.Module):
     def astype(self, dtype: Any) -> PredictionObserver:
         """The same observer in another floating type; boxes are rounded outward."""
         return cast(self, dtype)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """As `Observer.save`."""
+        from gsisio_jax.files import save_observer
+
+        save_observer(path, self)
 
 
 def blank(observer: PredictionObserver, initial: Interval) -> Carry:

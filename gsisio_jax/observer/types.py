@@ -5,6 +5,7 @@ The recursion itself stands in `step`.
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -176,6 +177,22 @@ class Observer(eqx.Module):
         """
         return in_type(self, dtype)
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write every number of the design into a file; `gsisio_jax.load_observer` reads it, given the system.
+
+        f and g may be anything, also lambdas: the file holds what tells them from others, and not their code.
+
+        Args:
+            path: of the file; one that is there is replaced, by the whole new one or not at all.
+
+        Raises:
+            OSError: it cannot be written there.
+            ValueError: the observer is traced.
+        """
+        from gsisio_jax.files import save_observer
+
+        save_observer(path, self)
+
 
 def in_type(observer: Observer, dtype: Any) -> Observer:
     """`Observer.astype`; remembers what it found for that observer."""
@@ -221,7 +238,7 @@ def cast(tree: Any, dtype: Any) -> Any:
 
 
 class Carry(eqx.Module):
-    """What one step hands to the next; a pytree of arrays that can be saved and resumed.
+    """What one step hands to the next; a pytree of arrays (`gsisio_jax.save_carry` writes it into a file).
 
     Attributes:
         state: box of x[k], (n,); before the first step, the initial box.

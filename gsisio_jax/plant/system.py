@@ -18,6 +18,7 @@ from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.plant.calls import as_static, as_vector, check_map, hashable, takes_u
 from gsisio_jax.plant.captured import Captured, captured, changed
 from gsisio_jax.plant.periodic import Periods, check_feedthrough, check_states, read_periods, turns
+from gsisio_jax.plant.pickled import check_named
 
 
 class System(eqx.Module):
@@ -141,6 +142,10 @@ class System(eqx.Module):
     def measurement(self, x: Any, u: Any) -> Any:
         """``g(x)`` or ``g(x, u)``, whichever the user gave."""
         return as_vector(self.g(x, u) if self.g_takes_u else self.g(x), self.l, x.dtype)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        check_named({"f": self.f, "g": self.g})
+        return super().__reduce_ex__(protocol)
 
     def check_unchanged(self, call: str) -> None:
         """Refuse to go on where numbers that f or g reads from around it have changed since the system was made."""

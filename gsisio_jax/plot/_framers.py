@@ -59,13 +59,18 @@ def framers(
     return style.handed_back(ax, axes)
 
 
-def save(dataset_or_estimate: Any, path: str | Path, signals: Sequence[str] | None = None) -> None:
+def save(
+    dataset_or_estimate: Any,
+    path: str | Path,
+    signals: Sequence[str] | None = None,
+    truth: Mapping[str, Any] | None = None,
+) -> None:
     """Draw `framers` into a file, without touching any open figure.
 
     Args:
         dataset_or_estimate: as for `framers`.
         path: file to write; its ending names the format.
-        signals: as for `framers`.
+        signals, truth: as for `framers`.
 
     Raises:
         MissingExtra: matplotlib is not installed.
@@ -75,7 +80,7 @@ def save(dataset_or_estimate: Any, path: str | Path, signals: Sequence[str] | No
     names = list(record.series) if signals is None else list(signals)
     figure = module.Figure(layout="constrained")
     axes = style.stacked(figure, len(names))
-    framers(dataset_or_estimate, names, ax=axes)
+    framers(dataset_or_estimate, names, {name: rows for name, rows in (truth or {}).items() if name in names}, axes)
     style.complete(figure, axes, record.title)
     figure.savefig(path, dpi=130)
 

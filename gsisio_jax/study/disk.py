@@ -1,11 +1,10 @@
-"""Files that are there whole or not at all, and one line for whatever a disk refuses."""
+"""Zarr arrays as a study stores them, and one line for whatever a disk refuses."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import os
-import uuid
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -14,8 +13,6 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax._extras import need
-
-PART = ".part"  # ending of everything that is not finished
 
 
 class StoreError(OSError, ValueError):
@@ -43,21 +40,6 @@ def encoded(chunk: np.ndarray) -> bytes:
     memory: dict[str, Any] = {}
     create_array(partial(zarr.create_array, memory, zarr_format=3), chunk.shape, chunk.shape, chunk.dtype)[...] = chunk
     return memory[".".join(["c", *["0"] * chunk.ndim])].to_bytes()
-
-
-def put(path: Path, data: bytes) -> None:
-    """Write a file so that it is there whole, on the disk, or not at all."""
-    part = path.with_name(f".{path.name}.{uuid.uuid4().hex}{PART}")
-    try:
-        with open(part, "xb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(part, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise
 
 
 def flush_folder(path: Path) -> None:

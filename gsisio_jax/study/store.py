@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax._extras import need
+from gsisio_jax._whole import PART, put
 from gsisio_jax.study.disk import (
-    PART,
     create_array,
     encoded,
     failure,
@@ -33,7 +33,6 @@ from gsisio_jax.study.disk import (
     flush_folder,
     is_empty,
     one_line_os_error,
-    put,
 )
 from gsisio_jax.study.header import DONE, Header, checked, difference
 from gsisio_jax.study.reader import backend, for_netcdf

@@ -8,6 +8,7 @@ from models.runner import Model, symmetric
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
+from gsisio_jax.examples import sir as epidemic
 
 
 def cstr() -> Model:
@@ -103,26 +104,10 @@ def building() -> Model:
 
 
 def sir() -> Model:
-    """Susceptible and infected share of a population, one day a step; infections beyond the model are unknown.
-
-    Kermack and McKendrick: beta = 0.3, gamma = 0.1 a day. Tests tell the infected, blood samples the recovered.
-    """
-
-    def f(x):
-        s, i = x
-        new = 0.3 * s * i
-        return [s - new, i + new - 0.1 * i]
-
-    system = gx.System(
-        f,
-        lambda x: [x[1], 1 - x[0] - x[1]],
-        G=[[-1.0], [1.0]],
-        H=np.zeros((2, 1)),
-        state_bounds=Interval([0.0, 0.0], [1.0, 1.0]),
-    )
+    """Susceptible and infected share of a population, one day a step; infections beyond the model are unknown."""
     return Model(
-        system,
-        gx.Noise(w=symmetric(1e-6, 1e-6), v=symmetric(5e-4, 5e-3)),
+        epidemic.system(),
+        epidemic.noise(),
         initial=Interval([0.9, 0.0], [1.0, 0.02]),
         region=Interval([0.0, 0.0], [1.0, 0.4]),
         d=lambda k: jnp.where((k > 30) & (k < 40), 2e-3, 2e-5)[:, None],  # of the population, a day
