@@ -33,7 +33,8 @@ def _classes() -> dict[str, type]:
     found = (
         Abstraction, AffineForm, AtomBounds, Certificate, Interval, Noise, PredictionObserver, System,
         bank.CancellationResidual, bank.LinearBounds, types.Carry, types.ExactInputs, types.InitialContraction,
-        types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, window.Window, window_widths.WindowWidths,
+        types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, window.Window,
+        window_widths.WindowWidths,
     )  # fmt: skip
     return {kind.__name__: kind for kind in found}
 

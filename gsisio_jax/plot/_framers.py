@@ -70,7 +70,8 @@ def save(
     Args:
         dataset_or_estimate: as for `framers`.
         path: file to write; its ending names the format.
-        signals, truth: as for `framers`.
+        signals: as for `framers`.
+        truth: as for `framers`.
 
     Raises:
         MissingExtra: matplotlib is not installed.
