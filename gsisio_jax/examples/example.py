@@ -113,7 +113,8 @@ class Example:
 
         Args:
             path: the file.
-            record, boxes: what is drawn; ``record()`` and its boxes where left out.
+            record: what is drawn; ``record()`` where left out.
+            boxes: of that record; computed where left out.
         """
         from gsisio_jax.plot import save
 
