@@ -37,7 +37,7 @@ def recovers(observer: Observer, width: np.ndarray, u_region: Interval) -> bool:
         start = known(Interval.unchecked(x - width / 2, x + width / 2), np.float64)
         noise = Noise.unchecked(*(known(box, np.float64) for box in (observer.noise.w, observer.noise.v)))
         plant, rows = numpy_function(nominal, x, u), []
-        for _ in range(system.n + 5):
+        for _ in range(system.n + 5 + getattr(observer, "delay", 0)):
             y, x = plant(x, u)
             rows.append(y)
         if not np.isfinite(rows).all():

@@ -1,0 +1,173 @@
+"""Designs with a delay: x[k] from y[0..k+L], where the unknown input shows L steps later (theory 5.8)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gsisio_jax.design.assemble import Plan
+from gsisio_jax.design.existence import check_existence, check_rank
+from gsisio_jax.design.feedthrough import factorise
+from gsisio_jax.design.recovery import recovers
+from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.certificate import Certificate
+from gsisio_jax.observer.delayed import DelayedObserver
+from gsisio_jax.observer.rounding_constants import slopes_of
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.plant.lift import LiftedRows, lifted, output_of
+from gsisio_jax.plant.system import Noise, System
+
+
+def check_delay(delay: Any, system: System, form: str) -> bool:
+    """Is a delay asked for?
+
+    Raises:
+        ValueError: it is no whole number, or goes with nothing.
+    """
+    whole = isinstance(delay, int | np.integer) and not isinstance(delay, bool)
+    if not (whole and delay >= 0) and not (isinstance(delay, str) and delay == "auto"):
+        raise ValueError(
+            f'design_observer: `delay` must be a whole number of steps, at least 0, or "auto", got {delay!r}'
+        )
+    if whole and delay == 0:
+        return False
+    if form == "prediction" or system.periodic or system.periodic_states:
+        raise ValueError(
+            "design_observer: `delay` must be 0 in the prediction form (which bounds x[k] from y[0..k-1]) and where "
+            "outputs or states are periodic (unwrap the outputs, numpy.unwrap, and leave the periods out), got "
+            f"{delay!r}"
+        )
+    return True
+
+
+def design_delayed(
+    design: Callable[[System, Noise], Observer],
+    system: System,
+    noise: Noise,
+    region: Interval | None,
+    u_region: Interval,
+    delay: int | str,
+) -> Observer | DelayedObserver:
+    """The observer of the lifted plant, in terms of the plant.
+
+    Args:
+        design: designs the ordinary observer of a system with some noise.
+        system, noise: the plant.
+        region: of the design, None where it is looked for.
+        u_region: known inputs of the design.
+        delay: L, or "auto": the smallest one up to n that works.
+    """
+    if isinstance(delay, str):
+        delay = _smallest(system, noise, region, u_region)
+    if not delay:
+        return design(system, noise)
+    plant = lifted(system, delay)
+    lift = output_of(plant)
+    assert lift is not None
+    rows = lift.rows(np.float64)
+    inner = design(plant, Noise(noise.w, _joined(noise, rows, delay)))
+    observer = DelayedObserver(system, noise, _certificate(inner.certificate, rows, system, delay), inner, delay)
+    steady = inner.certificate.steady_width
+    if inner.certificate.recoverable is None or not np.isfinite(steady).all():
+        return observer
+    certificate = replace(observer.certificate, recoverable=recovers(observer, steady, u_region))
+    return replace(observer, certificate=certificate)
+
+
+def with_delay(error: ObserverDoesNotExist, system: System, u_region: Interval) -> Exception:
+    """What is to be said where no observer exists: which longer delay would do, if one does."""
+    lift = output_of(system)
+    plant, delay = (system, 0) if lift is None else (lift.plant, lift.delay)
+    later = next((L for L in range(delay + 1, plant.n + 1) if _seen(lifted(plant, L), u_region)), None)
+    text = str(error).removeprefix("design_observer: no observer exists. ")
+    if later is not None:
+        steps = f"{later} step{'s' if later > 1 else ''}"
+        now = "without a delay" if not delay else f"with delay={delay}"
+        return ObserverDoesNotExist(
+            f"design_observer: {now} there is no observer, but the unknown input shows {steps} later: delay={later} "
+            f"gives boxes of x[k] from y[0..k+{later}]. {text}"
+        )
+    blocked = "" if lift is None else lift.rows(np.float64).blocked
+    if not delay or blocked:
+        return error
+    return ObserverDoesNotExist(
+        f"design_observer: no observer exists, with no delay up to n = {plant.n} steps. {text}"
+    )
+
+
+def _smallest(system: System, noise: Noise, region: Interval | None, u_region: Interval) -> int:
+    """delay="auto"."""
+    for delay in range(system.n + 1):
+        plant = lifted(system, delay) if delay else system
+        if _seen(plant, u_region, region, noise):
+            return delay
+    lift = output_of(plant)
+    blocked = "" if lift is None else lift.rows(np.float64).blocked
+    if blocked:
+        raise NoDesignFound(
+            f"design_observer: no delay up to n = {system.n} was found that shows the unknown input. Not all outputs "
+            f"could be followed over several steps: {blocked}. Measure more, or give `input_bounds` or `state_bounds`"
+        )
+    # Says which direction it is.
+    feedthrough = factorise(np.asarray(plant.H))
+    slopes_on = slopes_of(plant, feedthrough.T2, u_region)
+    try:
+        check_existence(plant, feedthrough, slopes_on(plant.state_bounds))
+    except ObserverDoesNotExist as error:
+        raise with_delay(error, plant, u_region) from None
+    raise NoDesignFound(
+        f"design_observer: with no delay up to n = {system.n} the unknown input shows at the centre of the region; try "
+        "a region around another point, or give `state_bounds`, `input_bounds` or more outputs"
+    )
+
+
+def _seen(system: System, u_region: Interval, region: Interval | None = None, noise: Noise | None = None) -> bool:
+    """Is no direction of the unknown input proved invisible, and do slopes at the centre of the region show it?"""
+    feedthrough = factorise(np.asarray(system.H))
+    slopes_on = slopes_of(system, feedthrough.T2, u_region)
+    try:
+        check_existence(system, feedthrough, slopes_on(system.state_bounds))
+        if region is not None and noise is not None:
+            slopes = slopes_on(region)
+            more = system.l - noise.v.shape[0]
+            v = Interval(np.pad(noise.v.lower, (0, more)), np.pad(noise.v.upper, (0, more)))
+            if slopes.finite:
+                check_rank(Plan(system, Noise(noise.w, v), feedthrough, u_region).problem(slopes))
+    except (ObserverDoesNotExist, NoDesignFound):
+        return False
+    return True
+
+
+def _joined(noise: Noise, rows: LiftedRows, delay: int) -> Interval:
+    """Bounds of the noise of all outputs of the lifted plant, for the design."""
+    sides = []
+    for low, high in ((noise.v.lower, noise.v.upper), (noise.v.upper, noise.v.lower)):
+        w = (noise.w.lower, noise.w.upper) if low is noise.v.lower else (noise.w.upper, noise.w.lower)
+        more = sum(
+            np.maximum(M, 0) @ np.tile(a, delay + 1) + np.minimum(M, 0) @ np.tile(b, delay + 1)
+            for M, (a, b) in ((rows.outputs, (low, high)), (rows.process, w))
+        )
+        sides.append(np.concatenate([np.asarray(low), more]))
+    return Interval(*sides)
+
+
+def _certificate(found: Certificate, rows: LiftedRows, system: System, delay: int) -> Certificate:
+    """The certificate of the lifted plant, its weights of noise as those of the plant's noise."""
+    l, more = system.l, len(rows.entries)
+    of_v = np.abs(rows.outputs).reshape(more, delay + 1, l).sum(1)
+    of_w = np.abs(rows.process).reshape(more, delay + 1, system.n).sum(1)
+
+    def split(weights: Any) -> tuple[np.ndarray, np.ndarray]:
+        weights = np.asarray(weights)
+        return weights[:, :l] + weights[:, l:] @ of_v, weights[:, l:] @ of_w
+
+    (noise_v, more_w), (input_v, input_w) = split(found.noise_v), split(found.input_noise_v)
+    note = f"delay {delay}: these are boxes of x[k] from y[0..k+{delay}]"
+    return replace(
+        found, noise_v=noise_v, noise_w=np.asarray(found.noise_w) + more_w, input_noise_v=input_v,
+        input_noise_w=input_w, notes=(*found.notes, note),
+    )  # fmt: skip

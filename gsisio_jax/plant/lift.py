@@ -1,0 +1,274 @@
+"""Outputs of the next steps as outputs of now: a plant whose unknown input shows later becomes one where it shows.
+
+    y[k+i] = g(x[k+i]) + ...,   x[k+i] = f(x[k+i-1]) + ...
+
+Where g, and f but for the last step back, are affine in what they take, an entry of y[k+i] is a function of x[k], of
+known inputs, unknown inputs and noise. Combinations of y[k..k+L] that are free of every unknown input are further
+outputs of x[k]. They are found in fractions, so they are free of d exactly: d has no bound.
+
+Source: theory 5.8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gsisio_jax.errors import NoDesignFound
+from gsisio_jax.inclusion.reader import AffineRow, affine_rows
+from gsisio_jax.plant.elimination import left_null_space, whole_numbers
+from gsisio_jax.plant.system import System
+
+Weights = dict[Any, Fraction]
+Pieces = tuple[float, ...]
+
+
+@dataclass
+class _Later:
+    """One entry of y[k+i]: weights of g(x[k]), of f(x[k]), of known inputs, noise and unknown inputs by (step, index),
+    all of steps after k, and a constant."""
+
+    g: Weights = field(default_factory=dict)
+    f: Weights = field(default_factory=dict)
+    u: Weights = field(default_factory=dict)
+    w: Weights = field(default_factory=dict)
+    d: Weights = field(default_factory=dict)
+    constant: Fraction = Fraction(0)
+
+
+@dataclass(frozen=True, eq=False)
+class LiftedRows:
+    """r further outputs: combinations of y[k..k+L] that are free of d, as numbers of one floating type.
+
+        outputs y[k..k+L] - known u[k..k+L] = of_g g(x[k]) + of_f f(x[k]) + constant + outputs v[k..k+L] + process w[k..]
+
+    Attributes:
+        outputs: (r, (L+1) l); known: (r, (L+1) m); process: (r, (L+1) n). Rounded to nearest.
+        of_f, of_g: for every row its (index, pieces), the sum of the pieces being the exact weight.
+        constant: for every row its pieces.
+        entries: for every row the outputs that enter it.
+        blocked: why entries of y[k+1..k+L] could not be used; empty where all were.
+    """
+
+    outputs: np.ndarray
+    known: np.ndarray
+    process: np.ndarray
+    of_f: tuple[tuple[tuple[int, Pieces], ...], ...]
+    of_g: tuple[tuple[tuple[int, Pieces], ...], ...]
+    constant: tuple[Pieces, ...]
+    entries: tuple[tuple[int, ...], ...]
+    blocked: str
+
+
+class LiftedOutput:
+    """g of the lifted plant: the g of the plant, and behind it the outputs of `LiftedRows`."""
+
+    def __init__(self, plant: System, delay: int):
+        self.plant, self.delay = plant, delay
+        with jax.enable_x64(True):
+            self._rows = {(np.dtype(np.float64), True): lifted_rows(plant, delay, np.float64)}
+
+    def rows(self, dtype: Any) -> LiftedRows:
+        """The rows for the constants that f and g have in that floating type."""
+        key = np.dtype(dtype), bool(jax.config.jax_enable_x64)
+        if key[0] == np.float64:
+            key = key[0], True
+        if key not in self._rows:
+            found = lifted_rows(self.plant, self.delay, key[0])
+            if found.entries != self._rows[np.dtype(np.float64), True].entries:
+                raise ValueError(
+                    f"design_observer(delay={self.delay}): in {key[0]} other combinations of the outputs are free of "
+                    "the unknown input than in float64, or constants of f and g stay in float64; give data in float64"
+                )
+            self._rows[key] = found
+        return self._rows[key]
+
+    def __call__(self, x: Any) -> Any:
+        return self.of(x, jnp.zeros(self.plant.m, x.dtype))
+
+    def of(self, x: Any, u: Any) -> Any:
+        """All outputs of the lifted plant at x."""
+        rows = self.rows(x.dtype)
+        f, g = self.plant.dynamics(x, u), self.plant.measurement(x, u)
+        later = []
+        for of_f, of_g, constant in zip(rows.of_f, rows.of_g, rows.constant, strict=True):
+            terms = [_times(piece, f[i]) for i, pieces in of_f for piece in pieces]
+            terms += [_times(piece, g[j]) for j, pieces in of_g for piece in pieces]
+            terms += [jnp.asarray(piece, x.dtype) for piece in constant]
+            later.append(sum(terms[1:], terms[0]))
+        return jnp.concatenate([g, jnp.stack(later)]) if later else g
+
+
+class LiftedOutputOfU(LiftedOutput):
+    """The same for plants whose f or g takes u."""
+
+    def __call__(self, x: Any, u: Any) -> Any:  # type: ignore[override]
+        return self.of(x, u)
+
+
+def _times(piece: float, value: Any) -> Any:
+    return value if piece == 1 else jnp.asarray(piece, value.dtype) * value
+
+
+def lifted(plant: System, delay: int) -> System:
+    """The plant with the combinations of y[k..k+L] that are free of d as further outputs of step k."""
+    output = (LiftedOutputOfU if plant.takes_u else LiftedOutput)(plant, delay)
+    more = len(output.rows(np.float64).entries)
+    below = np.zeros((more, plant.p)), np.zeros((more, plant.m))
+    return System(
+        plant.f, output, plant.G, np.vstack([plant.H, below[0]]), plant.B, np.vstack([plant.D, below[1]]),
+        plant.state_bounds, plant.input_bounds,
+    )  # fmt: skip
+
+
+def output_of(system: System) -> LiftedOutput | None:
+    """The lifted output of a system that `lifted` has made; None for any other."""
+    g = system.g
+    return g if isinstance(g, LiftedOutput) else None
+
+
+def lifted_rows(plant: System, delay: int, dtype: Any) -> LiftedRows:
+    """Combinations of y[k..k+L] that are free of d, beyond those of y[k] alone.
+
+    Args:
+        plant: its G, B and D are taken as they are, its H as the decimals that were written.
+        delay: L.
+        dtype: the constants of f and g are those of this type.
+    """
+    n, l, m, p = plant.n, plant.l, plant.m, plant.p
+    entries, blocked = _entries(plant, delay, affine_rows(plant.maps, n, m, dtype))
+    free = left_null_space([[e.d.get((t, q), Fraction(0)) for t in range(delay + 1) for q in range(p)]
+                            for e in entries.values()])  # fmt: skip
+    names, totals, weights = list(entries), [], []
+    for row in _beyond(free, [i for i, _ in names]):
+        integers = whole_numbers(row)
+        scale = 2 ** (max(map(abs, integers)) - 1).bit_length()
+        weight = {name: Fraction(v, scale) for name, v in zip(names, integers, strict=True) if v}
+        total = _Later()
+        for name, share in weight.items():
+            for kind in ("g", "f", "u", "w"):
+                _add(getattr(total, kind), getattr(entries[name], kind), share)
+            total.constant += share * entries[name].constant
+        if total.f or total.g:
+            totals.append(total)
+            weights.append(weight)
+
+    def matrix(rows: list[Weights], size: int) -> np.ndarray:
+        found = np.zeros((len(rows), delay + 1, size))
+        for r, row in enumerate(rows):
+            for at, value in row.items():
+                found[r][at] = _pieces(value, dtype)[0]
+        return found.reshape(len(rows), -1).astype(dtype)
+
+    def exact(rows: list[Weights]) -> tuple[tuple[tuple[int, Pieces], ...], ...]:
+        return tuple(tuple((i, _pieces(v, dtype)) for i, v in sorted(row.items())) for row in rows)
+
+    return LiftedRows(
+        matrix(weights, l), matrix([t.u for t in totals], m), matrix([t.w for t in totals], n),
+        exact([t.f for t in totals]), exact([t.g for t in totals]), tuple(_pieces(t.constant, dtype) for t in totals),
+        tuple(tuple(sorted({j for _, j in weight})) for weight in weights), blocked,
+    )  # fmt: skip
+
+
+def _entries(plant: System, delay: int, affine: list[AffineRow | None]) -> tuple[dict[tuple[int, int], _Later], str]:
+    """The entries (i, j) of y[k+i], i = 0..L, as functions of x[k]; and why some are left out."""
+    n, p, m = plant.n, plant.p, plant.m
+    G, B, D = ([[Fraction(float(v)) for v in row] for row in np.asarray(M)] for M in (plant.G, plant.B, plant.D))
+    H = [[Fraction(repr(float(v))) for v in row] for row in np.asarray(plant.H)]
+    found, blocked = {}, {}
+    for j in range(plant.l):
+        now = _Later(g={j: Fraction(1)})
+        _at(now, 0, H[j], D[j])
+        found[0, j] = now
+    for i in range(1, delay + 1):
+        for j in range(plant.l):
+            row = affine[n + j]
+            if row is None:
+                blocked[f"output {j + 1} is not affine in x"] = True
+                continue
+            entry = _Later()
+            _at(entry, i, H[j], D[j])
+            for t in range(i, 0, -1):  # from a row of x[k+t] to one of f(x[k+t-1])
+                _add(entry.u, {(t, q): v for q, v in row.inputs.items()}, Fraction(1))
+                entry.constant += row.constant
+                of_f = row.states
+                _add(entry.w, {(t - 1, s): v for s, v in of_f.items()}, Fraction(1))
+                for s, v in of_f.items():
+                    _add(entry.d, {(t - 1, q): G[s][q] for q in range(p)}, v)
+                    _add(entry.u, {(t - 1, q): B[s][q] for q in range(m)}, v)
+                if t == 1:
+                    entry.f, found[i, j] = of_f, entry
+                    break
+                before = _combined(affine, of_f)
+                if isinstance(before, int):
+                    blocked[f"f of state {before + 1}, which output {j + 1} needs, is not affine"] = True
+                    break
+                row = before
+    return found, "; ".join(blocked)
+
+
+def _combined(affine: list[AffineRow | None], weights: Weights) -> AffineRow | int:
+    """A combination of rows; the first that is missing where one is."""
+    states, inputs, constant = {}, {}, Fraction(0)
+    for s, weight in weights.items():
+        part = affine[s]
+        if part is None:
+            return s
+        _add(states, part.states, weight)
+        _add(inputs, part.inputs, weight)
+        constant += weight * part.constant
+    return AffineRow(states, inputs, constant)
+
+
+def _at(entry: _Later, step: int, H: list[Fraction], D: list[Fraction]) -> None:
+    _add(entry.d, {(step, q): v for q, v in enumerate(H)}, Fraction(1))
+    _add(entry.u, {(step, q): v for q, v in enumerate(D)}, Fraction(1))
+
+
+def _add(total: Weights, more: Weights, factor: Fraction) -> None:
+    """In place; zeros are left out."""
+    for key, value in more.items():
+        total[key] = total.get(key, Fraction(0)) + factor * value
+        if not total[key]:
+            del total[key]
+
+
+def _beyond(rows: list[list[Fraction]], steps: list[int]) -> list[list[Fraction]]:
+    """Those rows that say more than combinations of y[k] alone and of the rows before: their weights of later steps
+    are linearly independent."""
+    later = [c for c, i in enumerate(steps) if i > 0]
+    kept: list[list[Fraction]] = []
+    pivots: dict[int, list[Fraction]] = {}
+    for row in rows:
+        rest = [row[c] for c in later]
+        for column, pivot in pivots.items():
+            if rest[column]:
+                factor = rest[column] / pivot[column]
+                rest = [a - factor * b for a, b in zip(rest, pivot, strict=True)]
+        first = next((c for c, value in enumerate(rest) if value), None)
+        if first is not None:
+            pivots[first] = rest
+            kept.append(row)
+    return kept
+
+
+def _pieces(value: Fraction, dtype: Any) -> Pieces:
+    """Floating numbers of that type, largest first, whose sum is the fraction exactly."""
+    kind, pieces = np.dtype(dtype).type, []
+    smallest = float(np.finfo(dtype).tiny)
+    while value:
+        piece = float(kind(float(value)))
+        if not np.isfinite(piece) or abs(piece) < smallest:
+            raise NoDesignFound(
+                "design_observer: `delay` needs products of the constants of f, g and G that are exact as sums of "
+                f"numbers of type {np.dtype(dtype)}, and {float(value):.3g} is out of range; take a smaller delay, or "
+                "other units"
+            )
+        pieces.append(piece)
+        value -= Fraction(piece)
+    return tuple(pieces)
