@@ -160,11 +160,10 @@ def design_observer(
     given, u_region = _check(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
     if check_delay(delay, system, form):
 
-        def inner(plant: System, bounds_of: Noise) -> Observer:
-            return design_observer(
-                plant, bounds_of, region, gains=gains, u_region=u_region, missing=missing, sweeps=sweeps,
-                bounds=bounds, certify=certify, window=window,
-            )  # fmt: skip
+        def inner(plant: System, noise: Noise, quick: bool) -> Observer:
+            size: dict[str, Any] = {"gains": gains, "missing": missing, "window": window, "certify": certify}
+            size = {"missing": False, "certify": False} if quick else size
+            return design_observer(plant, noise, region, u_region=u_region, sweeps=sweeps, bounds=bounds, **size)
 
         return design_delayed(inner, system, noise, given, u_region, delay)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS

@@ -11,6 +11,7 @@ import numpy as np
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
+from gsisio_jax.design.shared_noise import combinations
 from gsisio_jax.design.recovery import recovers
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
@@ -18,7 +19,7 @@ from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.rounding_constants import slopes_of
 from gsisio_jax.observer.types import Observer
-from gsisio_jax.plant.lift import LiftedRows, lifted, output_of
+from gsisio_jax.plant.lift import LiftedRows, Pieces, lifted, output_of
 from gsisio_jax.plant.system import Noise, System
 
 
@@ -45,7 +46,7 @@ def check_delay(delay: Any, system: System, form: str) -> bool:
 
 
 def design_delayed(
-    design: Callable[[System, Noise], Observer],
+    design: Callable[[System, Noise, bool], Observer],
     system: System,
     noise: Noise,
     region: Interval | None,
@@ -55,7 +56,7 @@ def design_delayed(
     """The observer of the lifted plant, in terms of the plant.
 
     Args:
-        design: designs the ordinary observer of a system with some noise.
+        design: designs the ordinary observer of a system with some noise; as asked for, or quickly, for its widths.
         system, noise: the plant.
         region: of the design, None where it is looked for.
         u_region: known inputs of the design.
@@ -64,12 +65,30 @@ def design_delayed(
     if isinstance(delay, str):
         delay = _smallest(system, noise, region, u_region)
     if not delay:
-        return design(system, noise)
+        return design(system, noise, False)
     plant = lifted(system, delay)
-    lift = output_of(plant)
-    assert lift is not None
-    rows = lift.rows(np.float64)
-    inner = design(plant, Noise(noise.w, _joined(noise, rows, delay)))
+    inner = design(plant, _noise_of(plant, noise), True)
+    more = _more_rows(system, plant, inner, noise, u_region)
+    if more:
+        fuller = lifted(system, delay, more)
+        found = design(fuller, _noise_of(fuller, noise), False)
+        if (found.certificate.steady_width <= inner.certificate.steady_width * (1 + 1e-6)).all():
+            return _delayed(found, system, noise, u_region, delay)
+    return _delayed(design(plant, _noise_of(plant, noise), False), system, noise, u_region, delay)
+
+
+def _more_rows(system: System, plant: System, inner: Observer, noise: Noise, u_region: Interval) -> tuple[Pieces, ...]:
+    """Combinations that are worth an output of their own, because their noise is shared."""
+    steady = np.asarray(inner.certificate.steady_width)
+    slopes = slopes_of(system, np.zeros((0, system.l)), u_region)(inner.certificate.region)
+    if not (np.isfinite(steady).all() and slopes.finite):
+        return ()
+    return combinations(system, _rows(plant), noise, slopes, np.maximum(steady, 1e-12 * steady.max(initial=1.0)))
+
+
+def _delayed(inner: Observer, system: System, noise: Noise, u_region: Interval, delay: int) -> DelayedObserver:
+    """The observer in terms of the plant."""
+    rows = _rows(inner.system)
     observer = DelayedObserver(system, noise, _certificate(inner.certificate, rows, system, delay), inner, delay)
     steady = inner.certificate.steady_width
     if inner.certificate.recoverable is None or not np.isfinite(steady).all():
@@ -142,17 +161,25 @@ def _seen(system: System, u_region: Interval, region: Interval | None = None, no
     return True
 
 
-def _joined(noise: Noise, rows: LiftedRows, delay: int) -> Interval:
-    """Bounds of the noise of all outputs of the lifted plant, for the design."""
+def _rows(plant: System) -> LiftedRows:
+    lift = output_of(plant)
+    assert lift is not None
+    return lift.rows(np.float64)
+
+
+def _noise_of(plant: System, noise: Noise) -> Noise:
+    """Bounds of the noise of the lifted plant, for the design."""
+    rows = _rows(plant)
+    steps = rows.outputs.shape[1] // noise.v.shape[0]
     sides = []
     for low, high in ((noise.v.lower, noise.v.upper), (noise.v.upper, noise.v.lower)):
         w = (noise.w.lower, noise.w.upper) if low is noise.v.lower else (noise.w.upper, noise.w.lower)
         more = sum(
-            np.maximum(M, 0) @ np.tile(a, delay + 1) + np.minimum(M, 0) @ np.tile(b, delay + 1)
+            np.maximum(M, 0) @ np.tile(a, steps) + np.minimum(M, 0) @ np.tile(b, steps)
             for M, (a, b) in ((rows.outputs, (low, high)), (rows.process, w))
         )
         sides.append(np.concatenate([np.asarray(low), more]))
-    return Interval(*sides)
+    return Noise(noise.w, Interval(*sides))
 
 
 def _certificate(found: Certificate, rows: LiftedRows, system: System, delay: int) -> Certificate:

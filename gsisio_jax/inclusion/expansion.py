@@ -88,7 +88,7 @@ class Expansion:
             if with_values:
                 known = box.found[-1].value
                 at.append(atom_value(atom, states.center, thin, u, at, self.terms) if known is None else known)
-        return _stacked(box.found, at, states)
+        return _stacked(box.found, at if with_values else None, states)
 
     def values(self, x: Any, u: Any, wanted: Sequence[bool] | None = None) -> tuple[Any, Any]:
         """The atoms at a point x, and what rounding leaves of them, (J,) each."""
@@ -117,9 +117,9 @@ class Expansion:
         return needed
 
 
-def _stacked(found: list[BoundedAtom], at: list[Any], states: States) -> AtomBounds:
+def _stacked(found: list[BoundedAtom], at: list[Any] | None, states: States) -> AtomBounds:
     n, dtype = len(states.center), states.center.dtype
-    value, error = stacked_values(at, dtype) if len(at) == len(found) else (None, None)
+    value, error = (None, None) if at is None else stacked_values(at, dtype)
     if not found:
         none = jnp.zeros(0, dtype)
         return AtomBounds(jnp.zeros((0, n), dtype), none, none, Interval.unchecked(none, none), value, error)

@@ -30,9 +30,9 @@ Pieces = tuple[float, ...]
 
 @dataclass
 class _Later:
-    """One entry of y[k+i]: weights of g(x[k]), of f(x[k]), of known inputs, noise and unknown inputs by (step, index),
-    all of steps after k, and a constant."""
+    """A combination of y[k..k+L]: the weights of its parts, by step (from k) and index, and a constant."""
 
+    y: Weights = field(default_factory=dict)
     g: Weights = field(default_factory=dict)
     f: Weights = field(default_factory=dict)
     u: Weights = field(default_factory=dict)
@@ -52,6 +52,8 @@ class LiftedRows:
         of_f, of_g: for every row its (index, pieces), the sum of the pieces being the exact weight.
         constant: for every row its pieces.
         entries: for every row the outputs that enter it.
+        free: (f, (L+1) l) all combinations that are free of d, those of y[k] alone among them, to nearest; what `more`
+            is made of. free_process: (f, (L+1) n), free_f: (f, n) and free_g: (f, l), likewise.
         blocked: why entries of y[k+1..k+L] could not be used; empty where all were.
     """
 
@@ -63,15 +65,19 @@ class LiftedRows:
     constant: tuple[Pieces, ...]
     entries: tuple[tuple[int, ...], ...]
     blocked: str
+    free: np.ndarray
+    free_process: np.ndarray
+    free_f: np.ndarray
+    free_g: np.ndarray
 
 
 class LiftedOutput:
     """g of the lifted plant: the g of the plant, and behind it the outputs of `LiftedRows`."""
 
-    def __init__(self, plant: System, delay: int):
-        self.plant, self.delay = plant, delay
+    def __init__(self, plant: System, delay: int, more: tuple[Pieces, ...] = ()):
+        self.plant, self.delay, self.more = plant, delay, more
         with jax.enable_x64(True):
-            self._rows = {(np.dtype(np.float64), True): lifted_rows(plant, delay, np.float64)}
+            self._rows = {(np.dtype(np.float64), True): lifted_rows(plant, delay, np.float64, more)}
 
     def rows(self, dtype: Any) -> LiftedRows:
         """The rows for the constants that f and g have in that floating type."""
@@ -79,7 +85,7 @@ class LiftedOutput:
         if key[0] == np.float64:
             key = key[0], True
         if key not in self._rows:
-            found = lifted_rows(self.plant, self.delay, key[0])
+            found = lifted_rows(self.plant, self.delay, key[0], self.more)
             if found.entries != self._rows[np.dtype(np.float64), True].entries:
                 raise ValueError(
                     f"design_observer(delay={self.delay}): in {key[0]} other combinations of the outputs are free of "
@@ -115,9 +121,15 @@ def _times(piece: float, value: Any) -> Any:
     return value if piece == 1 else jnp.asarray(piece, value.dtype) * value
 
 
-def lifted(plant: System, delay: int) -> System:
-    """The plant with the combinations of y[k..k+L] that are free of d as further outputs of step k."""
-    output = (LiftedOutputOfU if plant.takes_u else LiftedOutput)(plant, delay)
+def lifted(plant: System, delay: int, more: tuple[Pieces, ...] = ()) -> System:
+    """The plant with the combinations of y[k..k+L] that are free of d as further outputs of step k.
+
+    Args:
+        plant: as it was given.
+        delay: L.
+        more: combinations of these combinations and of y[k], as weights of `LiftedRows.free`, as outputs besides.
+    """
+    output = (LiftedOutputOfU if plant.takes_u else LiftedOutput)(plant, delay, more)
     more = len(output.rows(np.float64).entries)
     below = np.zeros((more, plant.p)), np.zeros((more, plant.m))
     return System(
@@ -132,47 +144,66 @@ def output_of(system: System) -> LiftedOutput | None:
     return g if isinstance(g, LiftedOutput) else None
 
 
-def lifted_rows(plant: System, delay: int, dtype: Any) -> LiftedRows:
+def lifted_rows(plant: System, delay: int, dtype: Any, more: tuple[Pieces, ...] = ()) -> LiftedRows:
     """Combinations of y[k..k+L] that are free of d, beyond those of y[k] alone.
 
     Args:
         plant: its G, B and D are taken as they are, its H as the decimals that were written.
         delay: L.
         dtype: the constants of f and g are those of this type.
+        more: further rows, as weights of all rows that are free of d.
     """
     n, l, m, p = plant.n, plant.l, plant.m, plant.p
     entries, blocked = _entries(plant, delay, affine_rows(plant.maps, n, m, dtype))
     free = left_null_space([[e.d.get((t, q), Fraction(0)) for t in range(delay + 1) for q in range(p)]
                             for e in entries.values()])  # fmt: skip
-    names, totals, weights = list(entries), [], []
-    for row in _beyond(free, [i for i, _ in names]):
-        integers = whole_numbers(row)
-        scale = 2 ** (max(map(abs, integers)) - 1).bit_length()
-        weight = {name: Fraction(v, scale) for name, v in zip(names, integers, strict=True) if v}
-        total = _Later()
-        for name, share in weight.items():
+    names = list(entries)
+    free = [_scaled(row) for row in free]
+    rows = _beyond(free, [i for i, _ in names])
+    for shares in more:
+        exact = [Fraction(share) for share in shares]
+        rows.append([sum((a * row[c] for a, row in zip(exact, free, strict=True)), Fraction(0)) for c in range(len(names))])
+
+    def combined(row: list[Fraction]) -> _Later:
+        total = _Later(y={name: v for name, v in zip(names, row, strict=True) if v})
+        for name, share in total.y.items():
             for kind in ("g", "f", "u", "w"):
                 _add(getattr(total, kind), getattr(entries[name], kind), share)
             total.constant += share * entries[name].constant
-        if total.f or total.g:
-            totals.append(total)
-            weights.append(weight)
+        return total
 
-    def matrix(rows: list[Weights], size: int) -> np.ndarray:
-        found = np.zeros((len(rows), delay + 1, size))
+    def matrix(rows: list[Weights], *shape: int) -> np.ndarray:
+        found = np.zeros((len(rows), *shape))
         for r, row in enumerate(rows):
             for at, value in row.items():
                 found[r][at] = _pieces(value, dtype)[0]
         return found.reshape(len(rows), -1).astype(dtype)
 
-    def exact(rows: list[Weights]) -> tuple[tuple[tuple[int, Pieces], ...], ...]:
+    def exactly(rows: list[Weights]) -> tuple[tuple[tuple[int, Pieces], ...], ...]:
         return tuple(tuple((i, _pieces(v, dtype)) for i, v in sorted(row.items())) for row in rows)
 
+    totals, every, L = [t for t in map(combined, rows) if t.f or t.g], list(map(combined, free)), delay + 1
     return LiftedRows(
-        matrix(weights, l), matrix([t.u for t in totals], m), matrix([t.w for t in totals], n),
-        exact([t.f for t in totals]), exact([t.g for t in totals]), tuple(_pieces(t.constant, dtype) for t in totals),
-        tuple(tuple(sorted({j for _, j in weight})) for weight in weights), blocked,
-    )  # fmt: skip
+        outputs=matrix([t.y for t in totals], L, l),
+        known=matrix([t.u for t in totals], L, m),
+        process=matrix([t.w for t in totals], L, n),
+        of_f=exactly([t.f for t in totals]),
+        of_g=exactly([t.g for t in totals]),
+        constant=tuple(_pieces(t.constant, dtype) for t in totals),
+        entries=tuple(tuple(sorted({j for _, j in t.y})) for t in totals),
+        blocked=blocked,
+        free=matrix([t.y for t in every], L, l),
+        free_process=matrix([t.w for t in every], L, n),
+        free_f=matrix([t.f for t in every], n),
+        free_g=matrix([t.g for t in every], l),
+    )
+
+
+def _scaled(row: list[Fraction]) -> list[Fraction]:
+    """The row as whole numbers over a power of two, the largest up to 1."""
+    integers = whole_numbers(row)
+    scale = 2 ** (max(map(abs, integers)) - 1).bit_length()
+    return [Fraction(value, scale) for value in integers]
 
 
 def _entries(plant: System, delay: int, affine: list[AffineRow | None]) -> tuple[dict[tuple[int, int], _Later], str]:
