@@ -161,9 +161,10 @@ def design_observer(
     if check_delay(delay, system, form):
 
         def inner(plant: System, noise: Noise, quick: bool) -> Observer:
-            size: dict[str, Any] = {"gains": gains, "missing": missing, "window": window, "certify": certify}
-            size = {"missing": False, "certify": False} if quick else size
-            return design_observer(plant, noise, region, u_region=u_region, sweeps=sweeps, bounds=bounds, **size)
+            return design_observer(
+                plant, noise, region, gains=1 if quick else gains, u_region=u_region, missing=missing and not quick,
+                sweeps=sweeps, bounds=bounds, certify=certify and not quick, window=1 if quick else window, delay=0,
+            )  # fmt: skip
 
         return design_delayed(inner, system, noise, given, u_region, delay)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS

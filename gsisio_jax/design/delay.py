@@ -11,8 +11,8 @@ import numpy as np
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.existence import check_existence, check_rank
 from gsisio_jax.design.feedthrough import factorise
-from gsisio_jax.design.shared_noise import combinations
 from gsisio_jax.design.recovery import recovers
+from gsisio_jax.design.shared_noise import combinations
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.certificate import Certificate
@@ -113,9 +113,7 @@ def with_delay(error: ObserverDoesNotExist, system: System, u_region: Interval) 
     blocked = "" if lift is None else lift.rows(np.float64).blocked
     if not delay or blocked:
         return error
-    return ObserverDoesNotExist(
-        f"design_observer: no observer exists, with no delay up to n = {plant.n} steps. {text}"
-    )
+    return ObserverDoesNotExist(f"design_observer: no observer exists, with no delay up to n = {plant.n} steps. {text}")
 
 
 def _smallest(system: System, noise: Noise, region: Interval | None, u_region: Interval) -> int:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.rounding_constants import known
 from gsisio_jax.observer.scan import advance, blank
 from gsisio_jax.observer.types import Observer
@@ -16,7 +17,7 @@ from gsisio_jax.plant.system import Noise
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 
-def recovers(observer: Observer, width: np.ndarray, u_region: Interval) -> bool:
+def recovers(observer: Observer | DelayedObserver, width: np.ndarray, u_region: Interval) -> bool:
     """Run the observer without noise from the centre of the region, lose y[1], and look at what is left n + 3 steps on.
 
     Args:

@@ -54,7 +54,7 @@ def affine_rows(function: Callable[..., Any], n: int, m: int, dtype: Any) -> lis
     graph = Graph()
     inputs = [collected([graph.input(dtype) for _ in range(size)], (size,)) for size in (n, m)]
     (out,) = evaluate(graph, closed.jaxpr, closed.consts, inputs)
-    reader = _Reader(n, inputs, dtype)
+    reader = _Reader(n, inputs, dtype, np.float32, np.float64)
     return [reader.affine(value) for value in out]
 
 
@@ -65,8 +65,8 @@ _KNOWN = {"mul", "div", "integer_pow", "square", "pow", "atan2", "max", "min", "
 class _Reader:
     """Reads numbers into linear combinations of atoms."""
 
-    def __init__(self, n: int, inputs: list[np.ndarray], dtype: Any):
-        self.n, self.atoms, self.dtype = n, [], np.dtype(dtype)
+    def __init__(self, n: int, inputs: list[np.ndarray], *dtypes: Any):
+        self.n, self.atoms, self.dtypes = n, [], [np.dtype(dtype) for dtype in dtypes]
         self.read: dict[int, Linear] = {id(x): Linear({i: Fraction(1)}) for i, x in enumerate(inputs[0])}
         for j, u in enumerate(inputs[1]):
             self.read[id(u)] = self._atom(Atom("input", None, (), j))
@@ -82,7 +82,7 @@ class _Reader:
 
     def affine(self, value: Any) -> AffineRow | None:
         """A number as an affine function of x and u; None where it is none, or not known here."""
-        linear = self.linear(value) if is_constant(value) or value.dtype == self.dtype else None
+        linear = self.linear(value) if is_constant(value) or value.dtype in self.dtypes else None
         if linear is None:
             return None
         inputs: dict[int, Fraction] = {}
@@ -120,7 +120,7 @@ class _Reader:
 
     def _one(self, number: Number) -> Linear | None:
         name = number.name
-        if number.dtype != self.dtype or name not in _LINEAR | _KNOWN:
+        if number.dtype not in self.dtypes or name not in _LINEAR | _KNOWN:
             return None
         operands: list[Linear] = []
         for v in number.operands:

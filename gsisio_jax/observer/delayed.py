@@ -162,9 +162,11 @@ def advance(
 
 def _nothing(out: StepOutput) -> StepOutput:
     """The output of a step that finishes none."""
-    boxes = (entire_like(box) for box in (out.state, out.input, out.current_input))
-    margin = jnp.full_like(out.margin, jnp.inf)
-    return StepOutput(*boxes, jnp.full_like(out.status, int(Status.PENDING)), margin, jnp.zeros_like(out.source))
+    return StepOutput(
+        entire_like(out.state), entire_like(out.input), entire_like(out.current_input),
+        jnp.full_like(out.status, int(Status.PENDING)), jnp.full_like(out.margin, jnp.inf),
+        jnp.zeros_like(out.source),
+    )  # fmt: skip
 
 
 def to_the_end(observer: DelayedObserver, y: Any, u: Any, noise: Noise) -> tuple[Any, Any, Noise]:

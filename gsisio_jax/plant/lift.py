@@ -11,6 +11,7 @@ Source: theory 5.8.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
@@ -45,7 +46,8 @@ class _Later:
 class LiftedRows:
     """r further outputs: combinations of y[k..k+L] that are free of d, as numbers of one floating type.
 
-        outputs y[k..k+L] - known u[k..k+L] = of_g g(x[k]) + of_f f(x[k]) + constant + outputs v[k..k+L] + process w[k..]
+        outputs y[k..k+L] - known u[k..k+L]
+            = of_g g(x[k]) + of_f f(x[k]) + constant + outputs v[k..k+L] + process w[k..k+L]
 
     Attributes:
         outputs: (r, (L+1) l); known: (r, (L+1) m); process: (r, (L+1) n). Rounded to nearest.
@@ -77,19 +79,19 @@ class LiftedOutput:
     def __init__(self, plant: System, delay: int, more: tuple[Pieces, ...] = ()):
         self.plant, self.delay, self.more = plant, delay, more
         with jax.enable_x64(True):
-            self._rows = {(np.dtype(np.float64), True): lifted_rows(plant, delay, np.float64, more)}
+            self._rows = {(np.dtype(np.float64), np.dtype(np.float64)): lifted_rows(plant, delay, np.float64, more)}
 
     def rows(self, dtype: Any) -> LiftedRows:
         """The rows for the constants that f and g have in that floating type."""
-        key = np.dtype(dtype), bool(jax.config.jax_enable_x64)
-        if key[0] == np.float64:
-            key = key[0], True
+        wide = np.dtype(np.float64)
+        # Whether constants are of 64 bits where x is not depends on the setting of JAX.
+        key = np.dtype(dtype), wide if dtype == wide else np.dtype(jnp.result_type(float))
         if key not in self._rows:
-            found = lifted_rows(self.plant, self.delay, key[0], self.more)
-            if found.entries != self._rows[np.dtype(np.float64), True].entries:
+            found = lifted_rows(self.plant, self.delay, dtype, self.more)
+            if found.entries != self._rows[wide, wide].entries:
                 raise ValueError(
                     f"design_observer(delay={self.delay}): in {key[0]} other combinations of the outputs are free of "
-                    "the unknown input than in float64, or constants of f and g stay in float64; give data in float64"
+                    "the unknown input than in float64, or f and g cannot be read; give data in float64"
                 )
             self._rows[key] = found
         return self._rows[key]
@@ -130,8 +132,8 @@ def lifted(plant: System, delay: int, more: tuple[Pieces, ...] = ()) -> System:
         more: combinations of these combinations and of y[k], as weights of `LiftedRows.free`, as outputs besides.
     """
     output = (LiftedOutputOfU if plant.takes_u else LiftedOutput)(plant, delay, more)
-    more = len(output.rows(np.float64).entries)
-    below = np.zeros((more, plant.p)), np.zeros((more, plant.m))
+    count = len(output.rows(np.float64).entries)
+    below = np.zeros((count, plant.p)), np.zeros((count, plant.m))
     return System(
         plant.f, output, plant.G, np.vstack([plant.H, below[0]]), plant.B, np.vstack([plant.D, below[1]]),
         plant.state_bounds, plant.input_bounds,
@@ -162,7 +164,9 @@ def lifted_rows(plant: System, delay: int, dtype: Any, more: tuple[Pieces, ...] 
     rows = _beyond(free, [i for i, _ in names])
     for shares in more:
         exact = [Fraction(share) for share in shares]
-        rows.append([sum((a * row[c] for a, row in zip(exact, free, strict=True)), Fraction(0)) for c in range(len(names))])
+        rows.append(
+            [sum((a * row[c] for a, row in zip(exact, free, strict=True)), Fraction(0)) for c in range(len(names))]
+        )
 
     def combined(row: list[Fraction]) -> _Later:
         total = _Later(y={name: v for name, v in zip(names, row, strict=True) if v})
@@ -177,7 +181,7 @@ def lifted_rows(plant: System, delay: int, dtype: Any, more: tuple[Pieces, ...] 
         for r, row in enumerate(rows):
             for at, value in row.items():
                 found[r][at] = _pieces(value, dtype)[0]
-        return found.reshape(len(rows), -1).astype(dtype)
+        return found.reshape(len(rows), math.prod(shape)).astype(dtype)
 
     def exactly(rows: list[Weights]) -> tuple[tuple[tuple[int, Pieces], ...], ...]:
         return tuple(tuple((i, _pieces(v, dtype)) for i, v in sorted(row.items())) for row in rows)
