@@ -101,19 +101,31 @@ def with_delay(error: ObserverDoesNotExist, system: System, u_region: Interval) 
     """What is to be said where no observer exists: which longer delay would do, if one does."""
     lift = output_of(system)
     plant, delay = (system, 0) if lift is None else (lift.plant, lift.delay)
-    later = next((L for L in range(delay + 1, plant.n + 1) if _seen(lifted(plant, L), u_region)), None)
-    text = str(error).removeprefix("design_observer: no observer exists. ")
-    if later is not None:
-        steps = f"{later} step{'s' if later > 1 else ''}"
-        now = "without a delay" if not delay else f"with delay={delay}"
-        return ObserverDoesNotExist(
-            f"design_observer: {now} there is no observer, but the unknown input shows {steps} later: delay={later} "
-            f"gives boxes of x[k] from y[0..k+{later}]. {text}"
-        )
-    blocked = "" if lift is None else lift.rows(np.float64).blocked
-    if not delay or blocked:
+    if plant.periodic or plant.periodic_states:  # no delay goes with these
         return error
-    return ObserverDoesNotExist(f"design_observer: no observer exists, with no delay up to n = {plant.n} steps. {text}")
+    text = str(error).removeprefix("design_observer: no observer exists. ")
+    now = f"with delay={delay}" if delay else "without a delay"
+    blocked = ""
+    for later in range(delay + 1, plant.n + 1):
+        longer = lifted(plant, later)
+        blocked = _rows(longer).blocked
+        if _seen(longer, u_region):
+            return ObserverDoesNotExist(
+                f"design_observer: {now} there is no observer, but the unknown input shows {_steps(later)} later: "
+                f"delay={later} gives boxes of x[k] from y[0..k+{later}]. {text}"
+            )
+    if blocked:
+        return ObserverDoesNotExist(
+            f"design_observer: {now} there is no observer. Whether the unknown input shows later was not found out: "
+            f"{blocked}. {text}"
+        )
+    return ObserverDoesNotExist(
+        f"design_observer: no observer exists, with no delay up to n = {_steps(plant.n)}. {text}"
+    )
+
+
+def _steps(count: int) -> str:
+    return f"{count} step{'' if count == 1 else 's'}"
 
 
 def _smallest(system: System, noise: Noise, region: Interval | None, u_region: Interval) -> int:
@@ -122,12 +134,11 @@ def _smallest(system: System, noise: Noise, region: Interval | None, u_region: I
         plant = lifted(system, delay) if delay else system
         if _seen(plant, u_region, region, noise):
             return delay
-    lift = output_of(plant)
-    blocked = "" if lift is None else lift.rows(np.float64).blocked
-    if blocked:
+    if blocked := _rows(plant).blocked:
         raise NoDesignFound(
-            f"design_observer: no delay up to n = {system.n} was found that shows the unknown input. Not all outputs "
-            f"could be followed over several steps: {blocked}. Measure more, or give `input_bounds` or `state_bounds`"
+            f"design_observer: no delay up to n = {_steps(system.n)} was found that shows the unknown input. Not all "
+            f"outputs could be followed over several steps: {blocked}. Measure more, or give `input_bounds` or "
+            "`state_bounds`"
         )
     # Says which direction it is.
     feedthrough = factorise(np.asarray(plant.H))

@@ -92,7 +92,8 @@ class DelayedObserver(eqx.Module):
         if found is None:
             inner = self.inner.astype(dtype)
             self._lift.rows(dtype)  # refused here rather than in the middle of a run
-            found = replace(cast(replace(self, inner=None), dtype), inner=inner)
+            with jax.ensure_compile_time_eval():  # as in `Observer.astype`
+                found = replace(cast(replace(self, inner=None), dtype), inner=inner)
             object.__setattr__(self, "_typed", {**vars(self).get("_typed", {}), dtype: found})
         return found
 

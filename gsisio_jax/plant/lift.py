@@ -174,7 +174,7 @@ def lifted_rows(plant: System, delay: int, dtype: Any, more: tuple[Pieces, ...] 
             for kind in ("g", "f", "u", "w"):
                 _add(getattr(total, kind), getattr(entries[name], kind), share)
             total.constant += share * entries[name].constant
-        return total
+        return _binary(total)
 
     def matrix(rows: list[Weights], *shape: int) -> np.ndarray:
         found = np.zeros((len(rows), *shape))
@@ -201,6 +201,19 @@ def lifted_rows(plant: System, delay: int, dtype: Any, more: tuple[Pieces, ...] 
         free_f=matrix([t.f for t in every], n),
         free_g=matrix([t.g for t in every], l),
     )
+
+
+def _binary(total: _Later) -> _Later:
+    """A multiple of the combination, near it in size, whose weights of f, g and 1 have powers of two as denominators
+    (1 / 3 is no sum of floating numbers)."""
+    of_x = (*total.f.values(), *total.g.values(), total.constant)
+    factor = math.lcm(*(value.denominator for value in of_x))
+    factor //= factor & -factor
+    share = Fraction(factor, 2 ** (factor - 1).bit_length())
+    kinds = (
+        {key: share * value for key, value in kind.items()} for kind in (total.y, total.g, total.f, total.u, total.w)
+    )
+    return _Later(*kinds, constant=share * total.constant)
 
 
 def _scaled(row: list[Fraction]) -> list[Fraction]:
