@@ -119,7 +119,7 @@ def test_an_error_says_which_delay_would_do():
 def test_an_output_that_is_not_affine_is_no_proof():
     system = gx.System(lambda x: jnp.stack([x[0] + x[1], x[1]]), lambda x: jnp.sin(x[:1]), G=[[0.0], [1.0]], H=[[0.0]])
     noise = gx.Noise(Interval.symmetric([0.1, 0.1]), Interval.symmetric([0.1]))
-    with pytest.raises(gx.NoDesignFound, match="no delay up to n = 2 steps was found.* output 1 is not affine in x"):
+    with pytest.raises(gx.NoDesignFound, match=r"no delay up to n = 2 steps was found.* output 1 is not affine in x"):
         gx.design_observer(system, noise, Interval.symmetric([1.0, 1.0]), delay="auto")
     with pytest.raises(gx.ObserverDoesNotExist, match="was not found out: output 1 is not affine in x"):
         gx.design_observer(system, noise, Interval.symmetric([1.0, 1.0]))

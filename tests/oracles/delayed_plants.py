@@ -5,8 +5,10 @@ import numpy as np
 _MASS = np.array([[1, 0.1], [-0.4, 0.96]])
 _TWO = np.eye(4) + 0.1 * np.array([[0, 1, 0, 0], [-4, -0.4, 2, 0], [0, 0, 0, 1], [2, 0, -4, -0.4]])
 _MIXED = np.array([[0.8, 0.1, 0, 0], [-0.1, 0.7, 0.05, 0], [0, 0, 1, 0.1], [0.05, 0, -0.4, 0.96]])
+_SHORT = np.array([[0.8, 0.1, 0], [-0.1, 1, 0.1], [0.05, -0.4, 0.96]])
 _FORCE = np.array([[0.0], [0.1], [0.0], [0.0]])
 _BOTH = np.array([[1.0, 0.0], [0.3, 0.0], [0.2, 0.0], [0.0, 0.1]])
+_SUM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [1, 1, 0, 0]])
 _OUT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0]])
 
 # name: the plant, and the delay that it needs.
@@ -22,8 +24,12 @@ PLANTS = {
     "far mass": ((_TWO, np.eye(4)[[2]], _FORCE, np.zeros((1, 1)), [1e-4, 1e-3] * 2, [1e-3], [1.0] * 4), 3),
     # Two inputs: the first shows in the next step, in both outputs that the second needs, the second one step later.
     "orders": (
-        (_MIXED, _OUT + [[0, 0, 0, 0], [0, 0, 0, 0], [1, 0, 0, 0]], _BOTH, np.zeros((3, 2)), [0.01] * 4,
+        (_MIXED, _SUM, _BOTH, np.zeros((3, 2)), [0.01] * 4,
          [0.05, 0.02, 0.05], [1.0] * 4), 1,
+    ),
+    # The same with three states and two outputs.
+    "short orders": (
+        (_SHORT, np.eye(2, 3), _BOTH[[0, 2, 3]], np.zeros((2, 2)), [0.01] * 3, [0.05, 0.02], [1.0] * 3), 1,
     ),
     # The first shows at once.
     "at once": (
