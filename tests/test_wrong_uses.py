@@ -220,7 +220,7 @@ SWAPPED = {
     ),
     "delay in a sweep": (lambda o: gx.sweep(o.delayed, BOX, Y), "sweep: the observer has a delay", "jax.vmap"),
     "delay in a run": (
-        lambda o: gx.monte_carlo(o.delayed, 4, steps=3, key=0, x0=BOX),
+        lambda o: gx.monte_carlo(o.delayed, 0, 4, 3, BOX),
         "monte_carlo: the observer has a delay",
         "jax.vmap",
     ),

@@ -1,5 +1,6 @@
 """Observers with a delay: what they are given and return, in runs; and how near they come to the exact hull."""
 
+from fractions import Fraction
 from functools import lru_cache
 
 import jax
@@ -155,20 +156,41 @@ def test_rounding_costs_no_box(exact, dtype):
     assert not (np.asarray(est.status) & Status.CONFLICT).any()
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_combination_is_known_to_within_its_rounding(exact, dtype):
+    """Large measurements whose combination is small: what their products lose is in the noise. In fractions."""
+    observer, rng = exact[1], np.random.default_rng(0)
+    (weights,) = observer.inner.system.g.rows(dtype).outputs
+    zero = gx.Noise(*(Interval.symmetric(np.zeros((2, size), dtype)) for size in (3, 2)))
+    for _ in range(20):
+        y = (1e9 * rng.normal(size=(2, 2))).astype(dtype)
+        measured, bounds = observer.row(jnp.asarray(y), jnp.zeros((2, 0), dtype), zero)
+        truth = sum(Fraction(float(t)) * Fraction(float(e)) for t, e in zip(weights, y.ravel(), strict=True))
+        low, high = (
+            Fraction(float(measured[2])) - Fraction(float(side[2])) for side in (bounds.v.upper, bounds.v.lower)
+        )
+        assert low <= truth <= high
+        assert high - low < 1e10 * np.finfo(dtype).eps
+
+
 def duffing(x):
     return jnp.stack([x[0] + 0.1 * x[1], x[1] + 0.1 * (-x[0] - 0.5 * x[0] ** 3 - 0.4 * x[1])])
 
 
 def test_a_nonlinear_spring():
-    """Only what is measured later must be affine; the certificate holds in its region."""
-    system = gx.System(duffing, lambda x: x[:1], G=[[0.0], [0.1]], H=[[0.0]])
+    """Only what is measured later must be affine; known inputs of both steps count; the certificate holds."""
+    system = gx.System(duffing, lambda x, u: x[:1] + 2 * u[0], G=[[0.0], [0.1]], H=[[0.0]], B=[[0.7], [0.1]], D=[[0.3]])
     noise = gx.Noise(Interval.symmetric([1e-3, 1e-2]), Interval.symmetric([0.01]))
-    observer = gx.design_observer(system, noise, Interval.symmetric([2.0, 3.0]), delay=1, missing=False)
+    fast = {"delay": 1, "missing": False, "sweeps": 1}
+    observer = gx.design_observer(
+        system, noise, Interval.symmetric([2.0, 3.0]), u_region=Interval([-0.2], [0.2]), **fast
+    )
     start, widths = Interval.symmetric([1.0, 1.0]), observer.certificate.steady_width
-    runs = [gx.simulate(system, seed, np.array([0.9, -0.5]), 0.5 * np.ones((40, 1)) * (-1) ** seed, noise)
-            for seed in range(3)]  # fmt: skip
-    for run in runs:
-        est = gx.estimate(observer, start, run.y)
+    u = 0.2 * np.sin(np.arange(40.0))[:, None]
+    for seed in range(3):
+        d = np.full((40, 1), 0.5 * (-1) ** seed)
+        run = gx.simulate(system, seed, np.array([0.9, -0.5]), d, noise, u=u)
+        est = gx.estimate(observer, start, run.y, u)
         assert np.asarray(est.state.contains(run.x[: len(run.y)])).all()
         inside = (np.asarray(est.status) & Status.OUTSIDE_REGION) == 0
         assert inside[5:-1].any()
