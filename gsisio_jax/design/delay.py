@@ -19,7 +19,8 @@ from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.rounding_constants import slopes_of
 from gsisio_jax.observer.types import Observer
-from gsisio_jax.plant.lift import LiftedRows, Pieces, lifted, output_of
+from gsisio_jax.plant.later_outputs import LiftedRows
+from gsisio_jax.plant.lift import lifted, output_of
 from gsisio_jax.plant.system import Noise, System
 
 
@@ -68,22 +69,29 @@ def design_delayed(
         return design(system, noise, False)
     plant = lifted(system, delay)
     inner = design(plant, _noise_of(plant, noise), True)
-    more = _more_rows(system, plant, inner, noise, u_region)
-    if more:
-        fuller = lifted(system, delay, more)
+    fuller = _with_more(system, plant, inner, noise, u_region, delay)
+    if fuller is not None:
         found = design(fuller, _noise_of(fuller, noise), False)
         if (found.certificate.steady_width <= inner.certificate.steady_width * (1 + 1e-6)).all():
             return _delayed(found, system, noise, u_region, delay)
     return _delayed(design(plant, _noise_of(plant, noise), False), system, noise, u_region, delay)
 
 
-def _more_rows(system: System, plant: System, inner: Observer, noise: Noise, u_region: Interval) -> tuple[Pieces, ...]:
-    """Combinations that are worth an output of their own, because their noise is shared."""
+def _with_more(
+    system: System, plant: System, inner: Observer, noise: Noise, u_region: Interval, delay: int
+) -> System | None:
+    """The lifted plant with combinations that are worth an output of their own, because their noise is shared; None
+    where there are none."""
     steady = np.asarray(inner.certificate.steady_width)
     slopes = slopes_of(system, np.zeros((0, system.l)), u_region)(inner.certificate.region)
     if not (np.isfinite(steady).all() and slopes.finite):
-        return ()
-    return combinations(system, _rows(plant), noise, slopes, np.maximum(steady, 1e-12 * steady.max(initial=1.0)))
+        return None
+    width = np.maximum(steady, 1e-12 * steady.max(initial=1.0))
+    more = combinations(system, _rows(plant), noise, slopes, width)
+    try:
+        return lifted(system, delay, more) if more else None
+    except NoDesignFound:  # their weights have too many bits
+        return None
 
 
 def _delayed(inner: Observer, system: System, noise: Noise, u_region: Interval, delay: int) -> DelayedObserver:

@@ -11,10 +11,10 @@ import numpy as np
 
 from gsisio_jax.design.linear_program import LinearProgram
 from gsisio_jax.observer.rounding_constants import Slopes
-from gsisio_jax.plant.lift import LiftedRows, Pieces
+from gsisio_jax.plant.later_outputs import LiftedRows, Pieces
 from gsisio_jax.plant.system import Noise, System
 
-_BITS = 40  # of the weights that are kept: products of them stay short
+_BITS = 24  # of the weights that are kept: products of them stay short
 _WORTH = 0.01  # share of the width that a row must bring
 _SMALL = 1e-6  # weights that a solver leaves
 

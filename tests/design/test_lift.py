@@ -8,7 +8,8 @@ import pytest
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from gsisio_jax.plant.lift import lifted, lifted_rows
+from gsisio_jax.plant.later_outputs import lifted_rows
+from gsisio_jax.plant.lift import lifted
 
 
 def exact(matrix):
