@@ -23,6 +23,8 @@ from gsisio_jax.plant.later_outputs import LiftedRows
 from gsisio_jax.plant.lift import lifted, output_of
 from gsisio_jax.plant.system import Noise, System
 
+_EQUAL = 1e-3  # share of a width that weights of few bits may cost
+
 
 def check_delay(delay: Any, system: System, form: str) -> bool:
     """Is a delay asked for?
@@ -72,7 +74,7 @@ def design_delayed(
     fuller = _with_more(system, plant, inner, noise, u_region, delay)
     if fuller is not None:
         found = design(fuller, _noise_of(fuller, noise), False)
-        if (found.certificate.steady_width <= inner.certificate.steady_width * (1 + 1e-6)).all():
+        if (found.certificate.steady_width <= inner.certificate.steady_width * (1 + _EQUAL)).all():
             return _delayed(found, system, noise, u_region, delay)
     return _delayed(design(plant, _noise_of(plant, noise), False), system, noise, u_region, delay)
 

@@ -14,7 +14,7 @@ from gsisio_jax.observer.rounding_constants import Slopes
 from gsisio_jax.plant.later_outputs import LiftedRows, Pieces
 from gsisio_jax.plant.system import Noise, System
 
-_BITS = 24  # of the weights that are kept: products of them stay short
+_BITS = 40  # of the weights that are kept: products of them stay short
 _WORTH = 0.01  # share of the width that a row must bring
 _SMALL = 1e-6  # weights that a solver leaves
 
@@ -58,4 +58,4 @@ def combinations(
         if np.count_nonzero(shares) > 1:
             shares = shares / 2.0 ** np.ceil(np.log2(np.abs(shares).max()))
             found.append(tuple(float(s) for s in np.round(shares * 2.0**_BITS) / 2.0**_BITS))
-    return tuple(found)
+    return tuple(dict.fromkeys(found))
