@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -73,9 +74,10 @@ def design_delayed(
     inner = design(plant, _noise_of(plant, noise), True)
     fuller = _with_more(system, plant, inner, noise, u_region, delay)
     if fuller is not None:
-        found = design(fuller, _noise_of(fuller, noise), False)
-        if (found.certificate.steady_width <= inner.certificate.steady_width * (1 + _EQUAL)).all():
-            return _delayed(found, system, noise, u_region, delay)
+        with contextlib.suppress(NoDesignFound):
+            found = design(fuller, _noise_of(fuller, noise), False)
+            if (found.certificate.steady_width <= inner.certificate.steady_width * (1 + _EQUAL)).all():
+                return _delayed(found, system, noise, u_region, delay)
     return _delayed(design(plant, _noise_of(plant, noise), False), system, noise, u_region, delay)
 
 

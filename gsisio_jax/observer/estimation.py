@@ -129,7 +129,7 @@ def start(
         rounding: as in `estimate`.
 
     Returns:
-        The carry for `step` (a pytree that can be saved), and a `StepOutput`.
+        The carry for `step` (a pytree that can be saved), and a `StepOutput`; with a delay its status is PENDING.
 
     Source: theory 11.
     """
@@ -158,7 +158,8 @@ def step(
         rounding: as in `estimate`.
 
     Returns:
-        The next carry, and a `StepOutput`; its `input` is the box of d[k-1].
+        The next carry, and a `StepOutput`; its `input` is the box of d[k-1]. With a delay of L these are boxes of
+        x[k-L] and d[k-1-L], or nothing (status PENDING) where k < L; L missing rows at the end finish the last ones.
 
     Source: theory 11.
     """
