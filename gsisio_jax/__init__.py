@@ -9,6 +9,7 @@ from gsisio_jax.interval import Interval, hull, intersect, linear_image
 from gsisio_jax.observer import estimation
 from gsisio_jax.observer.alarms import Alarm
 from gsisio_jax.observer.certificate import Certificate
+from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.estimation import Estimate, estimate, start, step
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.status import Status
@@ -30,6 +31,7 @@ __all__ = [
     "Carry",
     "Certificate",
     "ContainmentLost",
+    "DelayedObserver",
     "Discretization",
     "Estimate",
     "FramerNotGuaranteed",

@@ -51,7 +51,7 @@ def to_dataset(
         ``xarray.Dataset`` with the dimension ``time``: ``<signal>_lower`` and ``<signal>_upper`` of every state and
         input, ``measured_<output>``, ``status`` (a bit mask with CF flag attributes) and ``margin``. The input box at
         step k is that of d_k, which needs y_{k+1}: its last entry is NaN. The attribute ``alarms`` is a JSON list of
-        ``{time, kind, index, gap, text}``.
+        ``{time, kind, index, gap, text}``; of an estimate with a delay, `delay` is its number of steps.
 
     Raises:
         ValueError: a batch of estimates, or a list of the wrong length.
@@ -101,12 +101,15 @@ def to_dataset(
         input_units=input_units,
         output_units=output_units,
     )
-    attributes = {
+    attributes: dict[str, Any] = {
         "title": title,
         "alarms": json.dumps(alarms, ensure_ascii=False),
         "certificate": "" if certificate is None else str(certificate),
         "library": f"gsisio_jax {__version__}",
     }
+    if delay := getattr(est, "delay", 0):
+        attributes["delay"] = delay
+        attributes["comment"] = f"the boxes of step k are from measurements up to step k + {delay}"
     return xarray.Dataset(variables, coords={"time": ("time", time, time_attributes)}, attrs=attributes)
 
 

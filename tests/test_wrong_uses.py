@@ -71,8 +71,15 @@ def observer():
 
 @pytest.fixture(scope="module")
 def objects(observer):
+    fast = {"missing": False, "sweeps": 1, "delay": 1}
+    bent = System(lambda x: 0.5 * jnp.sin(x), g, G=G, H=H)
     return SimpleNamespace(
-        observer=observer, system=observer.system, with_u=System(f_of_u, g, G=G, H=H, m=1), records=Records(BOX, Y)
+        delayed=gx.design_observer(observer.system, NOISE, BOX, **fast),
+        curved=gx.design_observer(bent, NOISE, BOX, **fast),
+        observer=observer,
+        system=observer.system,
+        with_u=System(f_of_u, g, G=G, H=H, m=1),
+        records=Records(BOX, Y),
     )
 
 
@@ -199,6 +206,38 @@ SWAPPED = {
     "gains a fraction": (design(NOISE, BOX, gains=1.5), "design_observer: `gains`", "whole number", "1.5"),
     "gains a word": (design(NOISE, BOX, gains="2"), "design_observer: `gains`", "whole number", "'2'"),
     "sweeps none": (design(NOISE, BOX, sweeps=0), "design_observer", "`sweeps` must be at least 1"),
+    "delay negative": (design(NOISE, BOX, delay=-1), "design_observer: `delay`", "whole number", '"auto"', "-1"),
+    "delay a fraction": (design(NOISE, BOX, delay=1.0), "design_observer: `delay`", "whole number"),
+    "delay a word": (design(NOISE, BOX, delay="yes"), "design_observer: `delay`", '"auto"', "'yes'"),
+    "delay predicted": (
+        design(NOISE, BOX, "prediction", delay=1),
+        "design_observer: `delay` must be 0 in the prediction form",
+    ),
+    "delay of an angle": (
+        lambda o: gx.design_observer(System(f, g, G=G, H=H, periodic={0: 6.0}), NOISE, BOX, delay=1),
+        "design_observer: `delay` must be 0",
+        "numpy.unwrap",
+    ),
+    "delay in a sweep": (lambda o: gx.sweep(o.delayed, BOX, Y), "sweep: the observer has a delay", "jax.vmap"),
+    "delay in a run": (
+        lambda o: gx.monte_carlo(o.delayed, 0, 4, 3, BOX),
+        "monte_carlo: the observer has a delay",
+        "jax.vmap",
+    ),
+    "delay tuned": (
+        lambda o: gx.tune_noise(o.delayed, o.records),
+        "tune_noise: `observer`",
+        "without a delay",
+        "DelayedObserver",
+    ),
+    "delay in a gradient": (
+        lambda o: gx.width_sensitivity(o.delayed, BOX, Y),
+        "width_sensitivity",
+        "without a delay",
+        "DelayedObserver",
+    ),
+    "y lifted": (lambda o: gx.estimate(o.delayed, BOX, np.zeros((3, 2))), "estimate", "shape (T, 1)", "got (3, 2)"),
+    "delay, curved": (lambda o: gx.tightness(o.curved, BOX, Y), "tightness: f or g is not affine", "delay"),
     "window a fraction": (design(NOISE, BOX, window=2.0), "design_observer: `window`", "whole number"),
     "missing a word": (design(NOISE, BOX, missing="no"), "design_observer: `missing`", "True or False", "'no'"),
     "certify a number": (design(NOISE, BOX, certify=1.0), "design_observer: `certify`", "True or False"),

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsisio_jax.design.assemble import Plan, assemble
 from gsisio_jax.design.dead_beat import dead_beat_rows
+from gsisio_jax.design.delay import check_delay, design_delayed, with_delay
 from gsisio_jax.design.existence import check_existence
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.first_gain import first_gain
@@ -28,10 +29,11 @@ from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_pre
 from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.region import find_region
 from gsisio_jax.design.window import window_rows
-from gsisio_jax.errors import NoDesignFound
+from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
+from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.recovery_constants import AffineMaps
@@ -55,7 +57,26 @@ def design_observer(
     bounds: Sequence[str] | None = None,
     certify: bool = True,
     window: int | Literal["auto"] = 1,
+    delay: Literal[0] = 0,
 ) -> Observer: ...
+
+
+@overload
+def design_observer(
+    system: System,
+    noise: Noise,
+    region: Interval | Literal["auto"],
+    form: Literal["current"] = "current",
+    *,
+    gains: int = 1,
+    u_region: Interval | None = None,
+    missing: bool = True,
+    sweeps: int = 3,
+    bounds: Sequence[str] | None = None,
+    certify: bool = True,
+    window: int | Literal["auto"] = 1,
+    delay: int | Literal["auto"],
+) -> Observer | DelayedObserver: ...
 
 
 @overload
@@ -88,7 +109,8 @@ def design_observer(
     derivative: Interval | None = None,
     certify: bool = True,
     window: int | Literal["auto"] = 1,
-) -> Observer | PredictionObserver:
+    delay: int | Literal["auto"] = 0,
+) -> Observer | PredictionObserver | DelayedObserver:
     """Design the gains of an interval observer offline, and certify the width of its boxes.
 
     Args:
@@ -120,13 +142,18 @@ def design_observer(
             chosen offline from simulated runs. 1 looks back one step; 3 to 5 come close to the exact hull where one
             step does not (rotations, chains, networks), at some more operations a step. "auto" takes 3 or 5 where
             simulated runs get 5 % narrower in some state, else 1.
+        delay: L: bound x[k] from y[0..k+L], for plants whose unknown input shows only L steps later (a force, where
+            positions are measured), or to smooth. Outputs, but for those of step k, must be affine in the state, and
+            so must be for L >= 2 the parts of f that they see. "auto" takes the smallest L up to n that shows every
+            unknown input. The result is a `DelayedObserver`; online its boxes come L steps late.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
         promises. A certificate may be absent or empty: the boxes are certain all the same.
 
     Raises:
-        ObserverDoesNotExist: an input direction is proved invisible.
+        ObserverDoesNotExist: an input direction is proved invisible, with this delay; the message says which delay
+            shows it, if one does.
         FramerNotGuaranteed: the prediction form is no framer for this system.
         NoDesignFound: no gain with finite boxes was found; says what failed, in which line of f or g where it is one,
             and what may help.
@@ -135,6 +162,15 @@ def design_observer(
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
     given, u_region = _check(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
+    if check_delay(delay, system, form):
+
+        def inner(plant: System, noise: Noise, quick: bool) -> Observer:
+            return design_observer(
+                plant, noise, region, gains=1 if quick else gains, u_region=u_region, missing=missing and not quick,
+                sweeps=sweeps, bounds=bounds, certify=certify and not quick, window=1 if quick else window, delay=0,
+            )  # fmt: skip
+
+        return design_delayed(inner, system, noise, given, u_region, delay)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS
     methods = check_methods("design_observer", default if bounds is None else bounds)
     if form == "prediction":
@@ -142,7 +178,10 @@ def design_observer(
     feedthrough = factorise(np.asarray(system.H))
     slopes_on = slopes_of(system, feedthrough.T2, u_region)
     everywhere = slopes_on(system.state_bounds)
-    check_existence(system, feedthrough, everywhere)
+    try:
+        check_existence(system, feedthrough, everywhere)
+    except ObserverDoesNotExist as error:
+        raise with_delay(error, system, u_region) from None
     plan = Plan(system, noise, feedthrough, u_region)
     box = _found_region(plan, slopes_on, certify) if given is None else given
     first = first_gain(plan, slopes_on, box, certify)

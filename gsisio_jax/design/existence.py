@@ -42,8 +42,8 @@ def check_existence(system: System, feedthrough: Feedthrough, everywhere: Slopes
     if direction is None:
         return
     raise ObserverDoesNotExist(
-        f"design_observer: no observer exists. The unknown input direction d = {_show(direction)} never reaches an "
-        "output: H d = 0, and the outputs that are free of d do not change when the state moves along "
+        f"design_observer: no observer exists. The unknown input direction d = {_show(direction)} reaches "
+        "no output: H d = 0, and the outputs that are free of d do not change when the state moves along "
         f"G d = {_show(G @ direction)}. Remedies: measure a state that it moves, or give `input_bounds` or "
         "`state_bounds` along this direction."
     )

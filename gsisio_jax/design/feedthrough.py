@@ -7,11 +7,12 @@ arithmetic on the decimals that the user wrote.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+
+from gsisio_jax.plant.elimination import left_null_space, whole_numbers
 
 _RANK_TOLERANCE = 1e-10  # singular values below this share of the largest count as zero: H is declared rank-deficient
 
@@ -69,33 +70,11 @@ def factorise(H: np.ndarray) -> Feedthrough:
 def _left_null_space(H: np.ndarray, rank: int) -> tuple[np.ndarray, bool]:
     """Rows that annihilate H. Exact in rationals where the user's decimals have that rank, else by SVD."""
     rows = [[Fraction(repr(float(value))) for value in row] for row in H]
-    basis = _rational_left_null_space(rows)
+    basis = [_as_floating(row) for row in left_null_space(rows)]
     if len(basis) == H.shape[0] - rank:
         return np.array([[float(value) for value in row] for row in basis]).reshape(len(basis), H.shape[0]), True
     U, _, _ = np.linalg.svd(H)
     return U[:, rank:].T, False
-
-
-def _rational_left_null_space(rows: list[list[Fraction]]) -> list[list[Fraction]]:
-    """Reduce [H | I] over the rationals; the rows whose H part vanished are the null space."""
-    l = len(rows)
-    p = len(rows[0])
-    work = [list(row) + [Fraction(int(i == j)) for j in range(l)] for i, row in enumerate(rows)]
-    pivot = 0
-    for column in range(p):
-        # Prefer a sparse pivot row: it keeps T2 sparse, and with it the gains usable when entries are missing.
-        candidates = [i for i in range(pivot, l) if work[i][column] != 0]
-        if not candidates:
-            continue
-        best = min(candidates, key=lambda i: (sum(value != 0 for value in work[i]), -abs(work[i][column])))
-        work[pivot], work[best] = work[best], work[pivot]
-        for i in range(l):
-            if i != pivot and work[i][column] != 0:
-                factor = work[i][column] / work[pivot][column]
-                work[i] = [a - factor * b for a, b in zip(work[i], work[pivot], strict=True)]
-        pivot += 1
-    null = [row[p:] for row in work[pivot:]]
-    return [_as_floating(row) for row in null]
 
 
 def _as_floating(row: list[Fraction]) -> list[Fraction]:
@@ -103,10 +82,7 @@ def _as_floating(row: list[Fraction]) -> list[Fraction]:
 
     Integers over a power of two: H d may be unbounded, so T2 H = 0 must not be lost by rounding T2.
     """
-    whole = math.lcm(*(value.denominator for value in row))
-    integers = [int(value * whole) for value in row]
-    shared = math.gcd(*integers)
-    integers = [value // shared for value in integers]
+    integers = whole_numbers(row)
     largest = max(map(abs, integers))
     if largest < 2**24:
         return [Fraction(value, 2 ** (largest - 1).bit_length()) for value in integers]

@@ -14,6 +14,7 @@ import numpy as np
 
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.certificate import Certificate
+from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.enclosures import known
 from gsisio_jax.observer.scan import advance, blank
 from gsisio_jax.observer.types import Observer
@@ -21,7 +22,7 @@ from gsisio_jax.plant.system import Noise
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 
-def with_recovery(observer: Observer, width: np.ndarray, u_region: Interval) -> Certificate:
+def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_region: Interval) -> Certificate:
     """The certificate, with `recoverable`, `recovery_steps` and `recovery_width`.
 
     Args:
@@ -29,7 +30,7 @@ def with_recovery(observer: Observer, width: np.ndarray, u_region: Interval) -> 
         width: typical width (n,) of the box to start from.
         u_region: known inputs of the design; its centre is applied.
     """
-    rows, n = observer.recovery, observer.system.n
+    rows, n = (observer.inner if isinstance(observer, DelayedObserver) else observer).recovery, observer.system.n
     if rows is not None:
         return replace(
             observer.certificate, recoverable=True, recovery_steps=(rows.length,) * n,
@@ -52,13 +53,14 @@ class _Trial:
     """A noise-free run from the centre of the region over n + 5 steps. In NumPy: a few steps take less time than the
     compilation of one."""
 
-    def __init__(self, observer: Observer, start: np.ndarray, u: np.ndarray, rows: np.ndarray):
+    def __init__(self, observer: Observer | DelayedObserver, start: np.ndarray, u: np.ndarray, rows: np.ndarray):
         self.observer, self.start, self.u, self.rows = observer, start, u, rows
         self.noise = Noise.unchecked(*(known(box, np.float64) for box in (observer.noise.w, observer.noise.v)))
         self.step: Any = None
+        self.delay = _delay(observer)
 
     @classmethod
-    def of(cls, observer: Observer, u_region: Interval) -> _Trial | None:
+    def of(cls, observer: Observer | DelayedObserver, u_region: Interval) -> _Trial | None:
         """None where the trajectory leaves the domain of f or g: nothing can be said for it."""
         system = observer.system
 
@@ -70,13 +72,13 @@ class _Trial:
         with jax.enable_x64(True):
             start, u = (np.asarray(box.center, np.float64) for box in (observer.certificate.region, u_region))
             x, plant, rows = start, numpy_function(nominal, start, u), []
-            for _ in range(system.n + 5):
+            for _ in range(system.n + 5 + _delay(observer)):
                 y, x = plant(x, u)
                 rows.append(y)
         return cls(observer, start, u, np.array(rows)) if np.isfinite(rows).all() else None
 
     def widths(self, initial: Interval, rows: np.ndarray) -> np.ndarray:
-        """Widths of the boxes, (n + 5, n)."""
+        """Widths of the boxes of the first n + 5 steps, (n + 5, n)."""
         with jax.enable_x64(True):
             begin = known(initial, np.float64)
             carry = numpy_function(lambda box: blank(self.observer, box), begin)(begin)
@@ -89,4 +91,8 @@ class _Trial:
             for y in rows:
                 carry, out = self.step(carry, y, self.u, self.noise)
                 found.append(np.asarray(out.state.upper) - np.asarray(out.state.lower))
-        return np.array(found)
+        return np.array(found[self.delay :])
+
+
+def _delay(observer: Observer | DelayedObserver) -> int:
+    return observer.delay if isinstance(observer, DelayedObserver) else 0

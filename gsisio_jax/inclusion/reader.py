@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
@@ -17,6 +18,7 @@ from gsisio_jax.inclusion.rules.functions import CURVES
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
 from gsisio_jax.scalar.unroll import collected, evaluate, numbers_in
 
+_MOST_NUMBERS = 100_000  # that `affine_rows` reads
 _MOST_OPERATIONS = 400  # of f and g together; beyond, bounds come from the engine over arrays
 
 
@@ -34,6 +36,28 @@ def expand(function: Callable[..., Any], n: int, m: int, dtype: Any) -> Expansio
     return _Reader(n, inputs, dtype).expansion(out)
 
 
+@dataclass(frozen=True)
+class AffineRow:
+    """``states . x + inputs . u + constant``, exact: {index: coefficient} without zeros."""
+
+    states: dict[int, Fraction]
+    inputs: dict[int, Fraction]
+    constant: Fraction
+
+
+def affine_rows(function: Callable[..., Any], n: int, m: int, dtype: Any) -> list[AffineRow | None]:
+    """Every component of ``function(x, u)`` that is affine in x and u, in fractions; None for the others."""
+    closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype))
+    (shape,) = closed.out_avals
+    if numbers_in(closed.jaxpr) > _MOST_NUMBERS or any(isinstance(const, Tracer) for const in closed.consts):
+        return [None] * shape.shape[0]
+    graph = Graph()
+    inputs = [collected([graph.input(dtype) for _ in range(size)], (size,)) for size in (n, m)]
+    (out,) = evaluate(graph, closed.jaxpr, closed.consts, inputs)
+    reader = _Reader(n, inputs, dtype, np.float32, np.float64)
+    return [reader.affine(value) for value in out]
+
+
 _LINEAR = {"add", "sub", "neg", "copy", "stop_gradient", "convert_element_type"}
 _KNOWN = {"mul", "div", "integer_pow", "square", "pow", "atan2", "max", "min", "abs", *CURVES}
 
@@ -41,8 +65,8 @@ _KNOWN = {"mul", "div", "integer_pow", "square", "pow", "atan2", "max", "min", "
 class _Reader:
     """Reads numbers into linear combinations of atoms."""
 
-    def __init__(self, n: int, inputs: list[np.ndarray], dtype: Any):
-        self.n, self.atoms, self.dtype = n, [], np.dtype(dtype)
+    def __init__(self, n: int, inputs: list[np.ndarray], *dtypes: Any):
+        self.n, self.atoms, self.dtypes = n, [], [np.dtype(dtype) for dtype in dtypes]
         self.read: dict[int, Linear] = {id(x): Linear({i: Fraction(1)}) for i, x in enumerate(inputs[0])}
         for j, u in enumerate(inputs[1]):
             self.read[id(u)] = self._atom(Atom("input", None, (), j))
@@ -55,6 +79,20 @@ class _Reader:
                 return None
             found.append(linear)
         return Expansion(self.n, self.atoms, found) if len(self.atoms) <= _MOST_OPERATIONS else None
+
+    def affine(self, value: Any) -> AffineRow | None:
+        """A number as an affine function of x and u; None where it is none, or not known here."""
+        linear = self.linear(value) if is_constant(value) or value.dtype in self.dtypes else None
+        if linear is None:
+            return None
+        inputs: dict[int, Fraction] = {}
+        for k, factor in linear.coefficients.items():
+            if k >= self.n:
+                source = self.atoms[k - self.n].source
+                if source is None:
+                    return None
+                inputs[source] = factor
+        return AffineRow({k: v for k, v in linear.coefficients.items() if k < self.n}, inputs, linear.constant)
 
     def _atom(self, atom: Atom) -> Linear:
         self.atoms.append(atom)
@@ -82,7 +120,7 @@ class _Reader:
 
     def _one(self, number: Number) -> Linear | None:
         name = number.name
-        if number.dtype != self.dtype or name not in _LINEAR | _KNOWN:
+        if number.dtype not in self.dtypes or name not in _LINEAR | _KNOWN:
             return None
         operands: list[Linear] = []
         for v in number.operands:

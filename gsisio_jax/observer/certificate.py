@@ -64,6 +64,7 @@ class Certificate(eqx.Module):
     recovery_steps: tuple[float, ...] = eqx.field(static=True, default=())
     recovery_width: Any = None
     window: Any = None
+    input_noise_w: Any = None  # (p, n), weight of w in input boxes beside that of `input_state_now`; None: nothing
 
     @property
     def rate(self) -> float:
@@ -136,7 +137,8 @@ class Certificate(eqx.Module):
 
     def input_width_after(self, now: Any, before: Any, noise: Noise) -> Any:
         """Width of the box of d[k-1] from the state widths at k and k-1, (p,) or a stack (..., p)."""
-        known = noise.w.width @ self.input_state_now.T + noise.v.width @ self.input_noise_v.T
+        of_w = self.input_state_now if self.input_noise_w is None else self.input_state_now + self.input_noise_w
+        known = noise.w.width @ of_w.T + noise.v.width @ self.input_noise_v.T
         return now @ self.input_state_now.T + before @ self.input_state_before.T + known + self.input_fixed
 
     def __str__(self) -> str:

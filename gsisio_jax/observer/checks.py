@@ -11,11 +11,12 @@ import numpy as np
 from gsisio_jax.interval.box import Interval, add, is_concrete
 from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.interval.rounding import Rounding, check_rounding
+from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise
 
-AnyObserver = Observer | PredictionObserver
+AnyObserver = Observer | PredictionObserver | DelayedObserver
 
 
 def check_on_conflict(call: str, on_conflict: str) -> bool:
@@ -27,11 +28,21 @@ def check_on_conflict(call: str, on_conflict: str) -> bool:
 
 def rounded(call: str, observer: AnyObserver, rounding: Rounding | None) -> AnyObserver:
     """The observer with the rounding that a call asks for."""
-    check_type(call, "observer", observer, (Observer, PredictionObserver), "it is what gx.design_observer returns")
+    check_type(call, "observer", observer, AnyObserver.__args__, "it is what gx.design_observer returns")
     if rounding is None:
         return observer
     check_rounding(call, rounding)
     return observer if observer.rounding == rounding else observer.with_rounding(rounding)
+
+
+def refuse_delay(call: str, observer: AnyObserver) -> None:
+    """For calls that hold the boxes of a step against its truth while it runs."""
+    if isinstance(observer, DelayedObserver):
+        raise ValueError(
+            f"{call}: the observer has a delay (of {observer.delay}), so a step does not finish its own box. "
+            "gx.estimate takes it, also over many cases: jax.vmap(lambda noise: gx.estimate(observer, initial, y, "
+            "noise=noise))(noises)"
+        )
 
 
 def check_length(length: Any, rows: int) -> None:

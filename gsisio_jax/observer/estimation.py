@@ -16,6 +16,7 @@ from gsisio_jax.interval.reading import check_type
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.alarms import Alarm, read_alarms
 from gsisio_jax.observer.checks import AnyObserver, check_length, check_on_conflict, normal, prepare
+from gsisio_jax.observer.delayed import DelayedObserver, to_the_end
 from gsisio_jax.observer.fixed import Fixed, chosen, fixed
 from gsisio_jax.observer.scan import advance, begin, blank, cut, scan
 from gsisio_jax.observer.types import Carry, StepOutput, cast
@@ -38,6 +39,8 @@ class Estimate(eqx.Module):
         source: (T,) code of that intersection (`gsisio_jax.observer.status.Source`).
         guaranteed: the boxes hold on the machine, rounding included; False for ``rounding="nearest"`` and for the
             prediction form, whose boxes hold up to rounding errors (where they are framers at all).
+        delay: L of an observer with a delay: the box of x[k] is from y[0..k+L], that of d[k] from y[0..k+1+L]. The
+            last L rows lack measurements, so they have the status MISSING and may be infinite.
 
     Source: theory 8 and 11.
     """
@@ -50,6 +53,7 @@ class Estimate(eqx.Module):
     source: Any
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     guaranteed: bool = eqx.field(static=True, default=True)
+    delay: int = eqx.field(static=True, default=0)
 
     def alarms(self) -> list[Alarm]:
         """Every step whose data contradict the stated bounds, in order, with what emptied and by how much.
@@ -148,7 +152,7 @@ def start(
         rounding: as in `estimate`.
 
     Returns:
-        The carry for `step` (a pytree that can be saved), and a `StepOutput`.
+        The carry for `step` (a pytree that can be saved), and a `StepOutput`; with a delay its status is PENDING.
 
     Source: theory 11.
     """
@@ -177,7 +181,8 @@ def step(
         rounding: as in `estimate`.
 
     Returns:
-        The next carry, and a `StepOutput`; its `input` is the box of d[k-1].
+        The next carry, and a `StepOutput`; its `input` is the box of d[k-1]. With a delay of L these are boxes of
+        x[k-L] and d[k-1-L], or nothing (status PENDING) where k < L; L missing rows at the end finish the last ones.
 
     Source: theory 11.
     """
@@ -222,6 +227,8 @@ def _estimate(
 ) -> Estimate:
     observer = chosen(static, traced)
     initial, noise = normal(initial, noise)
+    if isinstance(observer, DelayedObserver):
+        y, u, noise = to_the_end(observer, y, u, noise)
     _, out = scan(observer, blank(observer, initial), y, u, noise, hold)
     return _as_estimate(observer, out)
 
@@ -246,7 +253,9 @@ def _resume(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noi
 
 
 def _as_estimate(observer: AnyObserver, out: StepOutput) -> Estimate:
+    delay = observer.delay if isinstance(observer, DelayedObserver) else 0
+    out = jax.tree.map(lambda rows: rows[delay:], out) if delay else out  # the first rows finish no step
     return Estimate(
         out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows,
-        observer.guaranteed,
+        observer.guaranteed, delay,
     )  # fmt: skip

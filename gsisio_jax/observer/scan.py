@@ -10,9 +10,10 @@ import jax.numpy as jnp
 
 from gsisio_jax import scalar
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer import prediction_step
+from gsisio_jax.observer import delayed, prediction_step
 from gsisio_jax.observer import step as current_step
 from gsisio_jax.observer.checks import AnyObserver
+from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.fixed import Fixed, chosen, fixed
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.types import Carry, StepOutput
@@ -59,6 +60,8 @@ def begin(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise
 
 
 def _module(observer: AnyObserver) -> Any:
+    if isinstance(observer, DelayedObserver):
+        return delayed
     return prediction_step if isinstance(observer, PredictionObserver) else current_step
 
 

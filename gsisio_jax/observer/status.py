@@ -23,6 +23,7 @@ class Status(enum.IntFlag):
     OUTSIDE_REGION = 8  # boxes are certain, but the width promise does not apply
     CROSSED = 16  # prediction form only: the printed recursion lost its order
     AMBIGUOUS = 32  # periodic outputs only: several multiples of the period fit, so the entry says less, or nothing
+    PENDING = 64  # observers with a delay, online: the step that this one would finish lies before the record
 
 
 def bit_mask(bits: Iterable[tuple[Any, Status]]) -> Any:

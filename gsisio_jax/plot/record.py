@@ -131,7 +131,13 @@ def _read_estimate(est: Any, call: str) -> Record:
             series[name] = Series(name, "", lower[:, index], upper[:, index], None, kind)
     alarms = np.array([float(alarm.step) for alarm in est.alarms()])
     time = np.arange(np.shape(est.state.lower)[0], dtype=np.float64)
-    return Record("", time, "step", series, _missing(np.asarray(est.status)), alarms)
+    return Record(told_delay(est), time, "step", series, _missing(np.asarray(est.status)), alarms)
+
+
+def told_delay(est: Any) -> str:
+    """A title that says from when boxes with a delay are; none for others."""
+    delay = getattr(est, "delay", 0)
+    return f"boxes from measurements up to {delay} step{'s' if delay > 1 else ''} later" if delay else ""
 
 
 def sides_over_time(est: Any, kind: str) -> tuple[np.ndarray, np.ndarray]:

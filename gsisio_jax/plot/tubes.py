@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsisio_jax.plot.record import read_record, sides_over_time
+from gsisio_jax.plot.record import read_record, sides_over_time, told_delay
 from gsisio_jax.plot.study import (
     KINDS,
     axes_of,
@@ -141,7 +141,7 @@ def _of_estimate(call: str, est: Any) -> Tubes:
             name = f"{letter}{i + 1}"
             series[name] = Tube(name, "", kind, lower[..., i], upper[..., i])
     lead = tuple(f"axis {i}" for i in range(np.ndim(est.state.lower) - 2))
-    return Tubes("", np.arange(np.shape(est.state.lower)[-2], dtype=np.float64), "step", series, lead)
+    return Tubes(told_delay(est), np.arange(np.shape(est.state.lower)[-2], dtype=np.float64), "step", series, lead)
 
 
 def _of_study(dataset: Any) -> Tubes:

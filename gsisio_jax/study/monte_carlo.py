@@ -108,13 +108,15 @@ def monte_carlo(
     Raises:
         ContainmentLost: a box missed the truth, or a run broke its own bounds. The message says which run and step, and
             how to do that run again. Finished tiles of a store are kept.
-        ValueError: shapes or axes do not agree, a number is not legal, or a reduction is unknown.
+        ValueError: shapes or axes do not agree, a number is not legal, a reduction is unknown, or the observer has a
+            delay.
         MissingExtra: xarray is not installed.
 
     Source: theory 1, 11 and 13.
     """
     need("xarray", extra="study", purpose="a Monte Carlo study")
     observer = checks.rounded(CALL, observer, rounding)
+    checks.refuse_delay(CALL, observer)
     hold = checks.check_on_conflict(CALL, on_conflict)
     if on_miss not in ("raise", "record"):
         raise ValueError(f'{CALL}: `on_miss` must be "raise" or "record", got {on_miss!r}')

@@ -58,10 +58,10 @@ class RecordProgram:
             np.concatenate([center, -center]),
         )
 
-    def extreme(self, state: int, sign: int) -> Extreme:
-        """The least (sign 1) or the greatest (sign -1) value of a state in the last row."""
+    def extreme(self, state: int, sign: int, row: int = -1) -> Extreme:
+        """The least (sign 1) or the greatest (sign -1) value of a state in a row, the last one if none is given."""
         s, n = self.stretch.state.lower.shape
-        return self._solved((s - 1) * n + state, sign, (1.0, 1.0))
+        return self._solved(row % s * n + state, sign, (1.0, 1.0))
 
     def middle(self) -> Extreme:
         """The run that needs the least share of the radii of the noise; above 1 it agrees with no record."""
@@ -87,15 +87,16 @@ class RecordProgram:
         return Extreme(np.nan, failure="" if found.status == 2 else found.message)
 
 
-def exact_hull(stretch: Stretch, plant: Affine) -> Sides:
-    """The hull (n,) of the last state over all runs that agree with the stretch; NaN where none does.
+def exact_hull(stretch: Stretch, plant: Affine, row: int = -1) -> Sides:
+    """The hull (n,) of the state in a row, the last one if none is given, over all runs that agree with the stretch;
+    NaN where none does.
 
     Raises:
         RuntimeError: a program could not be solved.
     """
     program = RecordProgram(stretch, plant)
     n = stretch.state.lower.shape[1]
-    ends = [[program.extreme(i, sign) for i in range(n)] for sign in (1, -1)]
+    ends = [[program.extreme(i, sign, row) for i in range(n)] for sign in (1, -1)]
     if failure := next((end.failure for side in ends for end in side if end.failure), ""):
         raise RuntimeError(
             f"tightness: HiGHS could not solve a program of {stretch.length} rows ({failure}); try a shorter horizon, "

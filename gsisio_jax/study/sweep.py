@@ -88,13 +88,15 @@ def sweep(
         same for the noise of the design; infinite without a certificate.
 
     Raises:
-        ValueError: shapes or axes do not agree, a number is not legal, or a reduction is unknown.
+        ValueError: shapes or axes do not agree, a number is not legal, a reduction is unknown, or the observer has a
+            delay.
         MissingExtra: xarray is not installed.
 
     Source: theory 6 and 11.
     """
     need("xarray", extra="study", purpose="a sweep")
     observer = checks.rounded(CALL, observer, rounding)
+    checks.refuse_delay(CALL, observer)
     reductions = resolve(CALL, reduce, truth is not None)
     hold = checks.check_on_conflict(CALL, on_conflict)
     given = {

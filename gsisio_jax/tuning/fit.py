@@ -116,7 +116,8 @@ def tune_noise(
 def _check(observer: Any, records: Any, objective: str, method: str, tolerance: float, iterations: int) -> None:
     if not isinstance(observer, Observer):
         raise ValueError(
-            "tune_noise: `observer` must be of the current form, from `design_observer(..., form='current')`, got "
+            "tune_noise: `observer` must be of the current form, from `design_observer(..., form='current')` without "
+            "a delay, got "
             f"{type(observer).__name__}"
         )
     if not isinstance(records, Records):

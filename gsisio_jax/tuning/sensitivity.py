@@ -67,7 +67,10 @@ def width_sensitivity(
     """
     xarray = need("xarray", extra="tune", purpose="a labelled table")
     if not isinstance(observer, Observer):
-        raise ValueError(f"width_sensitivity: an observer of the current form is needed, got {type(observer).__name__}")
+        raise ValueError(
+            "width_sensitivity: an observer of the current form without a delay is needed, got "
+            f"{type(observer).__name__}"
+        )
     if (model is None) != (theta is None):
         raise ValueError("width_sensitivity: `model` and `theta` belong together; give both or none")
     call = "width_sensitivity"

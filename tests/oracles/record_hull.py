@@ -1,4 +1,4 @@
-"""The exact hull of the last state of a record of a linear plant: two linear programs a state."""
+"""The exact hull of a state of a record of a linear plant: two linear programs a state."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from scipy import sparse
 from scipy.optimize import linprog
 
 
-def exact_hull(A: Any, C: Any, w: Any, v: Any, start: Any, y: Any, G: Any = None, H: Any = None) -> np.ndarray:
+def exact_hull(
+    A: Any, C: Any, w: Any, v: Any, start: Any, y: Any, G: Any = None, H: Any = None, step: int = -1
+) -> np.ndarray:
     """Widths (n,) for ``x+ = A x + G d + w, y = C x + H d + v``; w, v and x0 are bounded, nothing is known of d.
 
     Args:
@@ -17,6 +19,7 @@ def exact_hull(A: Any, C: Any, w: Any, v: Any, start: Any, y: Any, G: Any = None
         w, v, start: bounds of magnitudes, (n,), (l,) and (n,); w and v also (T, n) and (T, l).
         y: (T, l); NaN where missing.
         G, H: (n, p) and (l, p); None without an unknown input.
+        step: of the state; the last one if none is given.
     """
     steps, n = len(y), len(A)
     G, H = (np.zeros((len(M), 0)) if N is None else N for M, N in ((A, G), (C, H)))
@@ -34,7 +37,7 @@ def exact_hull(A: Any, C: Any, w: Any, v: Any, start: Any, y: Any, G: Any = None
     width = []
     for i in range(n):
         cost = np.zeros(moves.shape[1])
-        cost[(steps - 1) * n + i] = 1
+        cost[step % steps * n + i] = 1
         low, high = (linprog(sign * cost, both, limits, bounds=(None, None)).fun * sign for sign in (1, -1))
         width.append(high - low)
     return np.array(width)
