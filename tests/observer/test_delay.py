@@ -109,7 +109,7 @@ def test_contained_whatever_the_input(spring):
 def test_contained_and_tight(name, window):
     """Width over hull at most 1.25, never below 1; hulls by an oracle."""
     (A, C, G, H, w, v, first), delay = PLANTS[name]
-    observer = designed(name, missing=False, window=window)
+    observer = designed(name, missing=False, window=window, sweeps=1)
     assert observer.delay == delay
     ratios, steps = [], [12, 17, 22 - delay]
     for seed in range(2):
@@ -133,7 +133,7 @@ def exact():
     A, C = plant.A.astype(np.float32), plant.C.astype(np.float32)
     system = gx.System(lambda x: jnp.asarray(A) @ x, lambda x: jnp.asarray(C) @ x, G=plant.G, H=plant.H)
     noise = gx.Noise(Interval.symmetric(np.full(3, 1e-9)), Interval.symmetric(np.full(2, 1e-9)))
-    return plant, gx.design_observer(system, noise, Interval.entire(3), missing=False, delay=1)
+    return plant, gx.design_observer(system, noise, Interval.entire(3), missing=False, delay=1, sweeps=1)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -225,7 +225,7 @@ def test_lost_rows_and_conflicts(spring, record):
 
 
 def test_what_later_measurements_contradict_is_an_alarm():
-    observer = designed("at once", missing=False, window=3)
+    observer = designed("at once", missing=False, window=3, sweeps=1)
     x, y, _ = simulated("at once", 1)
     y[12, 2] += 30.0
     est = gx.estimate(observer, start_box("at once"), y)
