@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsisio_jax.design.linear_program import LinearProgram
-from gsisio_jax.observer.rounding_constants import Slopes
+from gsisio_jax.observer.enclosures import Slopes
 from gsisio_jax.plant.later_outputs import LiftedRows, Pieces
 from gsisio_jax.plant.system import Noise, System
 
