@@ -41,8 +41,8 @@ def load_observer(path: str | os.PathLike[str], system: System, compare: Compare
             same to rounding.
 
     Returns:
-        `Observer` or `PredictionObserver`, in the floating type of the one that was saved: what was designed in float64
-        stays so also where ``jax_enable_x64`` is off, and is brought to float32 with the data, as ever.
+        `Observer`, `DelayedObserver` or `PredictionObserver`, in the floating type of the one that was saved: what was
+        designed in float64 stays so also where ``jax_enable_x64`` is off, and is brought to float32 with the data.
 
     Raises:
         OSError: the file is not there, or may not be read.

@@ -8,11 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax.plant.lift import lifted
+
 Node = Any
 """What JSON has of a value."""
 
 _GIVEN = {"System": ("f", "g", "captured", "turns")}
 """Fields that are no data: they come from the system that is given when a file is read."""
+
+
+_MORE = "more"
+"""What a file has of a `DelayedObserver` besides its fields: the combinations of `gsisio_jax.plant.lift.lifted`."""
 
 
 class Unknown(Exception):
@@ -27,11 +33,13 @@ def _classes() -> dict[str, type]:
     from gsisio_jax.interval.box import Interval
     from gsisio_jax.observer import bank, past, recovery, types, window, window_widths
     from gsisio_jax.observer.certificate import Certificate
+    from gsisio_jax.observer.delayed import DelayedObserver, Waiting
     from gsisio_jax.observer.prediction_step import PredictionObserver
     from gsisio_jax.plant.system import Noise, System
 
     found = (
-        Abstraction, AffineForm, AtomBounds, Certificate, Interval, Noise, PredictionObserver, System,
+        Abstraction, AffineForm, AtomBounds, Certificate, DelayedObserver, Interval, Noise, PredictionObserver, System,
+        Waiting,
         bank.CancellationResidual, bank.LinearBounds, types.Carry, types.ExactInputs, types.InitialContraction,
         types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, window.Window,
         window_widths.WindowWidths,
@@ -67,6 +75,8 @@ def encode(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Node:
     kind = type(value).__name__
     if _classes().get(kind) is type(value):
         fields = {field: encode(getattr(value, field), f"{name}.{field}", arrays) for field in _stored(type(value))}
+        if kind == "DelayedObserver":
+            fields[_MORE] = encode(value.lift.more, f"{name}.{_MORE}", arrays)
         return {"kind": kind, "fields": fields}
     if not hasattr(value, "dtype"):
         raise TypeError(f"{name} is of the class {kind}, which has no form in a file")
@@ -110,13 +120,18 @@ def _rebuilt(name: str, fields: dict[str, Node], arrays: dict[str, np.ndarray], 
     kind = _classes().get(name)
     if kind is None:
         raise Unknown(f"the part {name}")
-    expected = _stored(kind)
+    stored = _stored(kind)
+    expected = [*stored, _MORE] if name == "DelayedObserver" else stored
     for found, wanted, what in ((fields, expected, "unknown"), (expected, fields, "missing")):
         if strange := [field for field in found if field not in wanted]:
             raise Unknown(f"{what} {'fields' if len(strange) > 1 else 'field'} of {name}: {', '.join(strange)}")
-    made = object.__new__(kind)
-    for field in expected:
-        object.__setattr__(made, field, decode(fields[field], arrays, system))
+    made, within = object.__new__(kind), {}
+    if name == "DelayedObserver":
+        # Its inner observer is that of the lifted plant, whose outputs follow from the plant and a few weights.
+        more, delay = (decode(fields[field], arrays, system) for field in (_MORE, "delay"))
+        within["inner"] = lifted(system, delay, more)
+    for field in stored:
+        object.__setattr__(made, field, decode(fields[field], arrays, within.get(field, system)))
     for field in _GIVEN.get(name, ()):
         object.__setattr__(made, field, getattr(system, field))
     return made

@@ -9,6 +9,7 @@ Source: theory 5.9.
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -70,13 +71,14 @@ class DelayedObserver(eqx.Module):
     @property
     def output_rows(self) -> tuple[tuple[int, ...], ...]:
         """For every row of T2 the outputs of the plant that enter it, now or later."""
-        l, later = self.system.l, self._lift.rows(np.float64).entries
+        l, later = self.system.l, self.lift.rows(np.float64).entries
         return tuple(
             tuple(sorted({i for j in row for i in ((j,) if j < l else later[j - l])})) for row in self.inner.output_rows
         )
 
     @property
-    def _lift(self) -> LiftedOutput:
+    def lift(self) -> LiftedOutput:
+        """How the outputs of the lifted plant come from y[k..k+L]."""
         lift = output_of(self.inner.system)
         assert lift is not None
         return lift
@@ -91,18 +93,24 @@ class DelayedObserver(eqx.Module):
         found = vars(self).get("_typed", {}).get(dtype)
         if found is None:
             inner = self.inner.astype(dtype)
-            self._lift.rows(dtype)  # refused here rather than in the middle of a run
+            self.lift.rows(dtype)  # refused here rather than in the middle of a run
             with jax.ensure_compile_time_eval():  # as in `Observer.astype`
                 found = replace(cast(replace(self, inner=None), dtype), inner=inner)
             object.__setattr__(self, "_typed", {**vars(self).get("_typed", {}), dtype: found})
         return found
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write every number of the design into a file, as `Observer.save`."""
+        from gsisio_jax.files import save_observer
+
+        save_observer(path, self)
 
     def row(self, y: Any, u: Any, noise: Noise) -> tuple[Any, Noise]:
         """Measurement (l',) and noise bounds of the lifted plant for step k, from y, u and noise of k..k+L, (L+1, .).
 
         A combination is known to within what its products lose; that becomes part of its noise.
         """
-        rows = self._lift.rows(y.dtype)
+        rows = self.lift.rows(y.dtype)
         flat, seen = y.ravel(), jnp.isfinite(y.ravel())
         value = image(rows.outputs, point(jnp.where(seen, flat, 0)))
         if rows.known.any():

@@ -23,6 +23,17 @@ class LiftedOutput:
         with jax.enable_x64(True):
             self._rows = {(np.dtype(np.float64), np.dtype(np.float64)): lifted_rows(plant, delay, np.float64, more)}
 
+    def _parts(self) -> tuple[Any, ...]:
+        plant = self.plant
+        return plant.f, plant.g, self.delay, self.more, *(np.asarray(M).tobytes() for M in (plant.G, plant.H, plant.D))
+
+    def __eq__(self, other: object) -> bool:
+        """Made of the same plant in the same way: then compiled programs serve both."""
+        return isinstance(other, LiftedOutput) and self._parts() == other._parts()
+
+    def __hash__(self) -> int:
+        return hash(self._parts())
+
     def rows(self, dtype: Any) -> LiftedRows:
         """The rows for the constants that f and g have in that floating type."""
         wide = np.dtype(np.float64)

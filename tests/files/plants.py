@@ -50,6 +50,12 @@ def scalar():
     return gx.System(jnp.tanh, lambda x: x, G=[[0.5]], H=[[1.0]])
 
 
+def late():
+    """An input that shows one step later."""
+    return gx.System(lambda x: jnp.stack([x[0] + 0.1 * x[1], 0.9 * x[1] - 0.1 * jnp.sin(x[0])]), lambda x: x[:1],
+                     G=[[0.0], [0.1]], H=[[0.0]])  # fmt: skip
+
+
 KINDS = {
     "window": lambda: systems.s1().system,
     "bounded": bounded,
@@ -59,6 +65,7 @@ KINDS = {
     "planes": lambda: systems.s1().system,
     "nearest": plain,
     "single": plain,
+    "delayed": late,
 }
 
 
@@ -82,6 +89,9 @@ def design(kind):
         case "prediction":
             noise = gx.Noise(ball(0.1), ball(0.1))
             return gx.design_observer(plant, noise, Interval.entire(1), "prediction", left_inverse="feedthrough")
+        case "delayed":
+            noise = gx.Noise(NOISE.w, ball(0.05))
+            return gx.design_observer(plant, noise, ball(2.0, 2.0), delay=1, missing=False, sweeps=1)
     found = gx.design_observer(plant, NOISE, everywhere, missing=False, sweeps=1)
     match kind:
         case "no promise":

@@ -45,8 +45,8 @@ def test_many_runs_at_once(observer, tmp_path):
     assert Fixed(gx.load_carry(tmp_path / "carry", observer)[0]) == Fixed(many)
 
 
-def test_windows_and_the_prediction_form_keep_what_they_need(tmp_path):
-    for kind, size in (("window", 2), ("prediction", 1)):
+def test_windows_delays_and_the_prediction_form_keep_what_they_need(tmp_path):
+    for kind, size in (("window", 2), ("prediction", 1), ("delayed", 2)):
         observer = plants.design(kind)
         first = jax.tree.map(jnp.asarray, blank(observer, Interval.symmetric(np.ones(size))))
         gx.save_carry(tmp_path / "carry", first, observer, 1)
