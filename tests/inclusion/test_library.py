@@ -84,6 +84,16 @@ def _pair(box):
     return np.ravel(box.lower).tolist() + np.ravel(box.upper).tolist()
 
 
+def test_a_table_in_float32_serves_boxes_in_float64():
+    """Made where JAX knows only float32, it stays one in a design, which is in float64."""
+    knots, values = (jnp.asarray(part, jnp.float32) for part in (FEW, VALUES))
+    exact = inclusion.natural(lambda x: jnp.interp(x, FEW, VALUES))(Interval([0.2], [0.6]))
+    found = inclusion.natural(lambda x: jnp.interp(x, knots, values))(Interval([0.2], [0.6]))
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found.lower, exact.lower, atol=1e-6)
+    np.testing.assert_allclose(found.upper, exact.upper, atol=1e-6)
+
+
 def test_ranges_that_are_known():
     box = Interval(*WIDE)
     assert _pair(inclusion.natural(jnp.linalg.norm, "nearest")(box)) == [0, np.sqrt(2)]

@@ -215,11 +215,15 @@ def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLi
         return None
     body = jex.jaxpr_as_fun(eqn.params["jaxpr"])
     aval = eqn.invars[0].aval
+    # A table in float32 (made where that is all JAX has) stays one in the program, also where x is in float64.
+    table = [
+        np.asarray(part, to.dtype) for part, to in zip((knots, values), eqn.params["jaxpr"].in_avals[1:3], strict=True)
+    ]
 
     @jax.jit
     @jax.vmap
     def at(t: Any) -> Any:
-        return body(jnp.full(aval.shape, t, aval.dtype), knots, values, *others)[0].ravel()[0]
+        return body(jnp.full(aval.shape, t, aval.dtype), *table, *others)[0].ravel()[0]
 
     def run(points: np.ndarray) -> np.ndarray:
         with jax.ensure_compile_time_eval():
