@@ -8,6 +8,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
+from gsisio_jax.design.arguments import checked
 from gsisio_jax.design.assemble import Plan, assemble
 from gsisio_jax.design.dead_beat import dead_beat_rows
 from gsisio_jax.design.delay import check_delay, design_delayed, with_delay
@@ -28,11 +29,11 @@ from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
 from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.region import find_region
+from gsisio_jax.design.undefined import undefined_in
 from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
 from gsisio_jax.observer.prediction_step import PredictionObserver
@@ -161,7 +162,7 @@ def design_observer(
 
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
-    given, u_region = _check(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
+    given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
     if check_delay(delay, system, form):
 
         def inner(plant: System, noise: Noise, quick: bool) -> Observer:
@@ -196,6 +197,9 @@ def design_observer(
     observer = assemble(plan, problem, box, bank, input_bounds(problem, width), everywhere.affine, methods, sweeps)
     if first.uncertified:
         observer = replace(observer, certificate=observer.certificate.without_promise(first.uncertified))
+    if not everywhere.affine and (why := undefined_in(system, box, u_region)):
+        certificate = observer.certificate
+        observer = replace(observer, certificate=replace(certificate, notes=(*certificate.notes, why)))
     if window != 1:
         rows = window_rows(problem, window, width)
         observer = replace(observer, window=rows)
@@ -211,65 +215,6 @@ def design_observer(
     if not missing:
         return observer
     return replace(observer, certificate=with_recovery(observer, width, u_region))
-
-
-def _check(
-    system: System,
-    noise: Noise,
-    region: Interval | str,
-    form: str,
-    gains: int,
-    u_region: Interval | None,
-    sweeps: int,
-    window: int | str,
-    missing: Any,
-    certify: Any,
-) -> tuple[Interval | None, Interval]:
-    check_type("design_observer", "system", system, System)
-    check_type("design_observer", "noise", noise, Noise, "gx.Noise(w, v)")
-    if form not in ("current", "prediction"):
-        raise ValueError(f'design_observer: `form` must be "current" or "prediction", got {form!r}')
-    system.check_unchanged("design_observer")
-    for name, count in (("gains", gains), ("sweeps", sweeps)):
-        if isinstance(count, bool) or not isinstance(count, int | np.integer):
-            raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1, got {count!r}")
-    for name, flag in (("missing", missing), ("certify", certify)):
-        if not isinstance(flag, bool | np.bool_):
-            raise ValueError(f"design_observer: `{name}` must be True or False, got {flag!r}")
-    if gains < 1 or sweeps < 1:
-        raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
-    steps = window if isinstance(window, int | np.integer) and not isinstance(window, bool) else 0
-    if window != "auto" and steps < 1:
-        raise ValueError(
-            f'design_observer: `window` must be a whole number of steps, at least 1, or "auto", got {window!r}'
-        )
-    if window != 1 and (form == "prediction" or system.periodic_states):
-        raise ValueError(
-            "design_observer: `window` must be 1 in the prediction form and where states are periodic (boxes of "
-            f"different steps may lie a period apart), got {window!r}"
-        )
-    for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
-        if box.shape != (size,):
-            raise ValueError(
-                f"design_observer: the noise bounds of `{name}` must have shape ({size},), got {box.shape}"
-            )
-    auto = isinstance(region, str) and region == "auto"
-    if not auto and (not isinstance(region, Interval) or region.shape != (system.n,)):
-        got = f"shape {region.shape}" if isinstance(region, Interval) else f"{type(region).__name__} {region!r}"
-        raise ValueError(
-            f'design_observer: `region` must be an Interval of shape ({system.n},) or "auto", got '
-            f"{got if len(got) < 200 else type(region).__name__}"
-        )
-    if u_region is None:
-        if system.takes_u:
-            raise ValueError(
-                "design_observer: f or g takes u; give `u_region`, the box of known inputs for which the design holds"
-            )
-        u_region = Interval(np.zeros(system.m), np.zeros(system.m))
-    check_type("design_observer", "u_region", u_region, Interval, f"gx.Interval(lower, upper) of shape ({system.m},)")
-    if u_region.shape != (system.m,):
-        raise ValueError(f"design_observer: `u_region` must have shape ({system.m},), got {u_region.shape}")
-    return (region if isinstance(region, Interval) else None), u_region
 
 
 def _found_region(plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool) -> Interval:

@@ -76,7 +76,8 @@ def encode(value: Any, name: str, arrays: dict[str, np.ndarray]) -> Node:
     if _classes().get(kind) is type(value):
         fields = {field: encode(getattr(value, field), f"{name}.{field}", arrays) for field in _stored(type(value))}
         if kind == "DelayedObserver":
-            fields[_MORE] = encode(value.lift.more, f"{name}.{_MORE}", arrays)
+            observer: Any = value
+            fields[_MORE] = encode(observer.lift.more, f"{name}.{_MORE}", arrays)
         return {"kind": kind, "fields": fields}
     if not hasattr(value, "dtype"):
         raise TypeError(f"{name} is of the class {kind}, which has no form in a file")

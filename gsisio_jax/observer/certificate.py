@@ -148,7 +148,9 @@ class Certificate(eqx.Module):
         lines.append(f"  {'':<10}{'steady width':>14}{'region width':>14}{'slack':>14}")
         region_width = np.asarray(self.region.width)
         for i, width in enumerate(np.asarray(self.steady_width)):
-            lines.append(f"  state {i + 1:<4}{width:>14.6g}{region_width[i]:>14.6g}{self.slack[i]:>14.6g}")
+            # Where f and g are affine there is no region to leave, whatever region was given.
+            within = (f"{x:.6g}" if self.region_matters else "-" for x in (region_width[i], self.slack[i]))
+            lines.append(f"  state {i + 1:<4}{width:>14.6g}" + "".join(f"{x:>14}" for x in within))
         for j, width in enumerate(np.asarray(self.input_width)):
             lines.append(f"  input {j + 1:<4}{width:>14.6g}{'-':>14}{'-':>14}")
         if self.recoverable is not None:

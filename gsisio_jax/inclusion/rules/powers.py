@@ -20,11 +20,11 @@ def power(eqn: Any, x: Any, p: Any) -> Any:
     if is_node(p) or not is_concrete(p) or not is_node(x):
         return raise_to(x, p)
     shape = eqn.outvars[0].aval.shape
-    x, exponents = move(lambda v: jnp.broadcast_to(v, shape), x), np.broadcast_to(np.asarray(p, float), shape)
+    exponents = np.broadcast_to(np.asarray(p, float), shape)
     different = np.unique(exponents)
     if not 1 < len(different) <= _MOST_EXPONENTS:
-        return raise_to(x, p)
-    x = normalised(x)
+        return raise_to(x, p)  # an entry of a vector is raised by itself, with no shape
+    x = normalised(move(lambda v: jnp.broadcast_to(v, shape), x))
     found = integer_power(x, float(different[0]))
     for exponent in different[1:]:
         mask, other = exponents == exponent, integer_power(x, float(exponent))

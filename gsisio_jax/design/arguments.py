@@ -1,0 +1,85 @@
+"""What `design_observer` is given: types, shapes and ranges."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
+from gsisio_jax.plant.system import Noise, System
+
+
+def checked(
+    system: System,
+    noise: Noise,
+    region: Interval | str,
+    form: str,
+    gains: int,
+    u_region: Interval | None,
+    sweeps: int,
+    window: int | str,
+    missing: Any,
+    certify: Any,
+) -> tuple[Interval | None, Interval]:
+    """The region (None: it is to be looked for) and the box of known inputs.
+
+    Raises:
+        ValueError: an argument is no value that it can have; shapes do not agree.
+    """
+    check_type("design_observer", "system", system, System)
+    check_type("design_observer", "noise", noise, Noise, "gx.Noise(w, v)")
+    if form not in ("current", "prediction"):
+        raise ValueError(f'design_observer: `form` must be "current" or "prediction", got {form!r}')
+    system.check_unchanged("design_observer")
+    for name, count in (("gains", gains), ("sweeps", sweeps)):
+        if isinstance(count, bool) or not isinstance(count, int | np.integer):
+            raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1, got {count!r}")
+    for name, flag in (("missing", missing), ("certify", certify)):
+        if not isinstance(flag, bool | np.bool_):
+            raise ValueError(f"design_observer: `{name}` must be True or False, got {flag!r}")
+    if gains < 1 or sweeps < 1:
+        raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
+    steps = window if isinstance(window, int | np.integer) and not isinstance(window, bool) else 0
+    if window != "auto" and steps < 1:
+        raise ValueError(
+            f'design_observer: `window` must be a whole number of steps, at least 1, or "auto", got {window!r}'
+        )
+    if window != 1 and (form == "prediction" or system.periodic_states):
+        raise ValueError(
+            "design_observer: `window` must be 1 in the prediction form and where states are periodic (boxes of "
+            f"different steps may lie a period apart), got {window!r}"
+        )
+    for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
+        if box.shape != (size,):
+            raise ValueError(
+                f"design_observer: the noise bounds of `{name}` must have shape ({size},), got {box.shape}"
+            )
+    auto = isinstance(region, str) and region == "auto"
+    if not auto and (not isinstance(region, Interval) or region.shape != (system.n,)):
+        got = f"shape {region.shape}" if isinstance(region, Interval) else f"{type(region).__name__} {region!r}"
+        raise ValueError(
+            f'design_observer: `region` must be an Interval of shape ({system.n},) or "auto", got '
+            f"{got if len(got) < 200 else type(region).__name__}"
+        )
+    if isinstance(region, Interval):
+        bounds = system.state_bounds
+        apart = np.flatnonzero((region.lower > bounds.upper) | (region.upper < bounds.lower))
+        if len(apart):
+            i = int(apart[0])
+            raise ValueError(
+                "design_observer: `region` must have states in common with the state bounds, but of state "
+                f"{i + 1} it has [{region.lower[i]:g}, {region.upper[i]:g}] and they have "
+                f"[{bounds.lower[i]:g}, {bounds.upper[i]:g}]"
+            )
+    if u_region is None:
+        if system.takes_u:
+            raise ValueError(
+                "design_observer: f or g takes u; give `u_region`, the box of known inputs for which the design holds"
+            )
+        u_region = Interval(np.zeros(system.m), np.zeros(system.m))
+    check_type("design_observer", "u_region", u_region, Interval, f"gx.Interval(lower, upper) of shape ({system.m},)")
+    if u_region.shape != (system.m,):
+        raise ValueError(f"design_observer: `u_region` must have shape ({system.m},), got {u_region.shape}")
+    return (region if isinstance(region, Interval) else None), u_region
