@@ -107,8 +107,10 @@ def test_at_a_conflict_the_input_box_is_the_input_bounds(bounded):
     est = record(run(bounded, Interval.symmetric([1.0, 1.0]), y), 0)
     assert has(est, gx.Status.CONFLICT).nonzero()[0].tolist() == [12]
     assert (est.input.lower[11], est.input.upper[11]) == (-1.0, 2.0)
-    # The measured state restarts from y; nothing is known of the other.
-    assert est.state.width[12].tolist() == [pytest.approx(0.2), np.inf]
+    # y alone gives no whole box, so neither it nor the past is believed; the next row is the first again.
+    assert est.state.width[12].tolist() == [np.inf, np.inf]
+    assert est.state.width[13].tolist() == [pytest.approx(0.2), np.inf]
+    assert np.isfinite(est.state.width[14]).all()
     assert not any(np.isnan(leaf).any() for leaf in jax.tree.leaves(est))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 import gsisio_jax as gx
 from gsisio_jax.errors import ContainmentLost
-from gsisio_jax.study import disk, kernel
+from gsisio_jax.study import kernel
 from gsisio_jax.study import store as store_module
 from gsisio_jax.study.job import Job
 
@@ -74,7 +74,7 @@ def die_writing() -> None:
     def half(path: Path, data: bytes) -> None:
         files[0] += 1
         if files[0] == 202:
-            path.with_name(f".{path.name}.half{disk.PART}").write_bytes(data[: len(data) // 2])
+            path.with_name(f".{path.name}.half{store_module.PART}").write_bytes(data[: len(data) // 2])
             os.kill(os.getpid(), signal.SIGKILL)
         put(path, data)
 

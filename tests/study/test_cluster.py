@@ -119,7 +119,7 @@ def test_a_worker_killed_while_it_writes(study, expected, client, tmp_path, monk
     compiled = [address for address, worker in client.run(faults.state).items() if worker["programs"]]
     client.run(faults.die_writing, workers=compiled[:1])
     same(gx.sweep(**study, client=client, store=tmp_path / "store"), expected)
-    assert sum(1 for _ in (tmp_path / "store").glob(f"*/.*half{faults.disk.PART}")) <= 1
+    assert sum(1 for _ in (tmp_path / "store").glob(f"*/.*half{faults.store_module.PART}")) <= 1
     monkeypatch.setattr(cluster_module, "_send", lambda *_: pytest.fail("computed again"))
     same(gx.sweep(**study, client=client, store=tmp_path / "store"), expected)
 
