@@ -57,7 +57,6 @@ class _Trial:
         self.observer, self.start, self.u, self.rows = observer, start, u, rows
         self.noise = Noise.unchecked(*(known(box, np.float64) for box in (observer.noise.w, observer.noise.v)))
         self.step: Any = None
-        self.delay = _delay(observer)
 
     @classmethod
     def of(cls, observer: Observer | DelayedObserver, u_region: Interval) -> _Trial | None:
@@ -91,7 +90,7 @@ class _Trial:
             for y in rows:
                 carry, out = self.step(carry, y, self.u, self.noise)
                 found.append(np.asarray(out.state.upper) - np.asarray(out.state.lower))
-        return np.array(found[self.delay :])
+        return np.array(found[_delay(self.observer) :])
 
 
 def _delay(observer: Observer | DelayedObserver) -> int:

@@ -59,9 +59,10 @@ def single_precision(observer: Observer) -> Observer:
 
     slopes = slopes_of(system, narrow.T2, u_region, np.float32)
     region = slopes(observer.certificate.region)
+    affine = None if observer.recovery is None else AffineMaps.of(system, narrow.T2, np.float32)
     found = with_rounding_constants(
         narrow, system, region, slopes(system.state_bounds), *first_form(system, narrow.T2, u_region, np.float32),
-        np.float32,
+        affine, np.float32,
     )  # fmt: skip
     return jax.tree.map(lambda x: jnp.asarray(x, np.float32), found)
 
@@ -73,6 +74,7 @@ def with_rounding_constants(
     everywhere: Slopes,
     form: AffineForm,
     slack: np.ndarray,
+    affine: AffineMaps | None,
     dtype: Any,
 ) -> Observer:
     """The observer with the constants that rounding asks for, its gains being what they are in `dtype`.
@@ -82,6 +84,7 @@ def with_rounding_constants(
         plant: the system as it was given, in float64.
         region, everywhere: enclosures of the derivatives on the region and on the state bounds.
         form, slack: from `first_form`.
+        affine: bounds that rows of recovery stand on; needed where there are any.
         dtype: float64 or float32.
     """
     wide: Any = jax.tree.map(lambda x: np.asarray(x, np.float64), observer)
@@ -137,7 +140,7 @@ def with_rounding_constants(
     if window is not None:
         left_x, left_d = window_residual(window, system, wide.C, wide.bounded_inputs, H_slack)
         window = _cast_window(window, left_x, left_d, wide.T2, dtype)
-    recovery = _recovery(wide, system, H_slack, dtype)
+    recovery = None if affine is None else _recovery(wide, system, affine, H_slack, dtype)
     first = InitialContraction(
         form=None if system.g_takes_u else jax.tree.map(lambda x: np.asarray(x, dtype), form),
         slack=_cast(slack, dtype),
@@ -178,26 +181,30 @@ def _corrections(rate: float) -> int:
 def with_output(bank: LinearBounds, T2: Any) -> LinearBounds:
     """The bank with ``output = remainder T2`` rounded once, and exactly 0 where it is 0: as `image` takes it to be."""
     dtype = bank.remainder.dtype
-    products = [exact(Z).dot(exact(T2)) if Z.size else np.zeros((len(Z), T2.shape[1])) for Z in bank.remainder]
-    return replace(bank, output=np.array(products, np.float64).reshape(bank.output.shape).astype(dtype))
+    products = [_rounded_once(Z, T2) for Z in bank.remainder]
+    return replace(bank, output=np.array(products).reshape(bank.output.shape).astype(dtype))
+
+
+def _rounded_once(remainder: np.ndarray, T2: Any) -> np.ndarray:
+    """``remainder T2`` (r, l) in float64."""
+    return np.asarray(exact(remainder).dot(exact(T2)), np.float64).reshape(len(remainder), T2.shape[1])
 
 
 def _cast_window(window: Any, left_x: np.ndarray, left_d: np.ndarray, T2: np.ndarray, dtype: Any) -> Any:
     """Multipliers as they are in that type; what they leave, rounded up; ``output = remainder T2`` rounded once."""
-    output = exact(window.remainder).dot(exact(T2)).astype(np.float64).reshape(window.output.shape)
-    stored = replace(window, output=output)
+    stored = replace(window, output=_rounded_once(window.remainder, T2))
     stored = jax.tree.map(lambda x: np.asarray(x, dtype), replace(stored, left_x=np.zeros(0), left_d=np.zeros(0)))
     return replace(stored, left_x=_cast(left_x, dtype), left_d=_cast(left_d, dtype))
 
 
-def _recovery(wide: Any, system: Any, H_slack: np.ndarray, dtype: Any) -> Any:
+def _recovery(wide: Any, system: Any, affine: AffineMaps, H_slack: np.ndarray, dtype: Any) -> Any:
     """The rows of recovery, as `_cast_window`; None where they do not hold in that type."""
     if wide.recovery is None:
         return None
-    rows = replace(wide.recovery, output=exact(wide.recovery.remainder).dot(exact(wide.T2)).astype(np.float64))
+    rows = replace(wide.recovery, output=_rounded_once(wide.recovery.remainder, wide.T2))
     rows = jax.tree.map(lambda x: np.asarray(x, dtype).astype(np.float64), rows)
-    free, maps = ~(wide.bounded_inputs != 0).any(0), AffineMaps.of(system, wide.T2, dtype)
-    found = None if maps is None else with_constants(rows, system, maps, wide.T2, H_slack, free, dtype)
+    free = ~(wide.bounded_inputs != 0).any(0)
+    found = with_constants(rows, system, affine, wide.T2, H_slack, free, dtype)
     if found is None:
         return None
     sides = known(found.constant, dtype)
