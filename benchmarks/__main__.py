@@ -16,8 +16,8 @@ from typing import Any
 RESULTS = Path(__file__).resolve().parent / "results"
 SIZES = {  # full, quick
     "compiled": ({"batch": 100_000, "steps": 100}, {"batch": 5_000, "steps": 50}),
-    "limit": ({"batch": 100_000, "steps": 100}, {"batch": 4_000, "steps": 50}),
-    "limit stored": ({"batch": 20_000, "steps": 100}, {"batch": 4_000, "steps": 50}),
+    "limit": ({"batch": 102_400, "steps": 100}, {"batch": 4_096, "steps": 50}),
+    "limit stored": ({"batch": 20_480, "steps": 100}, {"batch": 4_096, "steps": 50}),
     "numpy": ({"batch": 2_000, "steps": 100}, {"batch": 1_000, "steps": 20}),
     "tanks": ({"steps": 100}, {"steps": 50}),
     "peers bounds": ({"boxes": 100_000}, {"boxes": 4_000}),

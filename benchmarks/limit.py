@@ -27,7 +27,7 @@ from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.observer.step import advance, blank
 from gsisio_jax.scalar import scalar_program
 
-TILE = 2000
+TILE = 256  # as long studies of this plant are cut
 THREADS = 2
 ROUNDS = 3
 WIDER = 1e-6  # that the older library's boxes may be narrower than ours, in the mean

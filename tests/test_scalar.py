@@ -52,3 +52,22 @@ def test_reverse_mode_keeps_only_arguments():
     closed = jax.make_jaxpr(jax.grad(lambda a: total(scalar.scan, a, B[0], X[0])))(A[0])
     kept = [eqn.outvars for eqn in closed.jaxpr.eqns if eqn.primitive.name == "scan"]
     assert sum(v.aval.shape == (4,) for v in kept[0]) <= 3 + 4  # results, and what comes into a step: a, b, x
+
+
+def test_no_two_kept_numbers_are_written_by_one_operation():
+    """XLA, with the flags of the command line, would copy both arrays whole at every turn."""
+
+    def body(carry, row):
+        low, high = jnp.sin(carry[0] + row), jnp.cos(carry[1] - row)
+        return (low, high), (low * high, low + high, low - high, jnp.stack([low, high]))
+
+    xs = jnp.arange(50.0)
+    compiled = jax.jit(lambda a, b: scalar.scan(body, (a, b), xs)).lower(1.0, 2.0).compile()
+    fusions = [
+        line for line in compiled.as_text().splitlines() if " fusion(" in line and "dynamic-update-slice" in line
+    ]
+    assert fusions
+    assert not [line for line in fusions if " = (" in line], "several results"
+    found, expected = compiled(1.0, 2.0), jax.lax.scan(body, (1.0, 2.0), xs)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)

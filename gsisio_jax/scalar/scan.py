@@ -21,6 +21,8 @@ Measured over single numbers and over arrays (two cores shared with other work, 
 74,000 a first call of 17 and 10 s, .62 and 6.8 microseconds a step and box; at 88,000 23 and 10 s, .76 and 8.7; at
 136,000 39 and 9 s, 2.1 and 11.5."""
 
+_SHAPES = 32  # of kept numbers; NumPy allows 64 axes
+
 
 def scan(
     body: Callable[..., Any],
@@ -45,14 +47,25 @@ def scan(
 
     def step(numbers: Any, row: Any) -> tuple[Any, Any]:
         out = run(program, [*consts, *numbers, *row])
-        return tuple(out[:count]), tuple(out[count:])
+        return tuple(out[:count]), tuple(_apart(out[count:]))
 
     numbers = tuple(entry for leaf in flat_carry for entry in _entries(leaf, 0))
     columns = tuple(entry for leaf in rows for entry in _entries(leaf, 1))
     last, kept = jax.lax.scan(step, numbers, columns, length=turns)
     leaves = program.results
-    packed = _packed([*last], leaves[: len(flat_carry)], ()) + _packed([*kept], leaves[len(flat_carry) :], (turns,))
+    packed = _packed([*last], leaves[: len(flat_carry)], ()) + _packed(
+        [entry.reshape(turns) for entry in kept], leaves[len(flat_carry) :], (turns,)
+    )
     return jax.tree.unflatten(structure, packed)
+
+
+def _apart(entries: Sequence[Any]) -> list[Any]:
+    """Numbers to be kept, each in a shape of its own: (), (1,), (1, 1) and so on.
+
+    XLA keeps them by writing into arrays over all turns. Arrays of one shape that are written at one place it fuses into
+    one operation with several results, which, where a loop is one function, copies them whole at every turn.
+    """
+    return [jnp.reshape(entry, (1,) * (i % _SHAPES)) for i, entry in enumerate(entries)]
 
 
 def call(function: Callable[..., Any], *args: Any) -> Any:

@@ -17,7 +17,7 @@ from gsisio_jax.study import devices
 from gsisio_jax.study.axes import Layout
 from gsisio_jax.study.certified_widths import along, promised
 from gsisio_jax.study.crew import Crew
-from gsisio_jax.study.kernel import chunk_size, fingerprint, outline, run_cases, tile_size
+from gsisio_jax.study.kernel import fingerprint, outline, run_cases, tile_size
 from gsisio_jax.study.reduction_base import Reduction
 from gsisio_jax.study.row_source import Rows
 
@@ -89,9 +89,9 @@ class Job:
         if dtype != np.float64:
             observer = observer.astype(dtype)
         one, shared = layout.take(arguments, np.zeros(1, int)), layout.shared(arguments)
-        shapes, cost, step = outline(observer, one, shared, rows, reductions, hold)
-        size, chosen = _batch(call, batch, cost, layout.cases), cost if batch is None else None
-        chunk = min(chunk_size(step), size)
+        planned = outline(observer, one, shared, rows, reductions, hold)
+        size, chosen = _batch(call, batch, planned.cost, layout.cases), planned.cost if batch is None else None
+        chunk, shapes = min(planned.chunk(layout.cases), size), planned.shapes
         return cls(call, observer, arguments, layout, rows, reductions, hold, size, chunk, shapes, chosen)
 
     def on(self, mesh: Any) -> Job:

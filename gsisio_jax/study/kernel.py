@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import is_dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ from gsisio_jax.observer import scan
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.plant.periodic import nearest
+from gsisio_jax.scalar.options import loop_bytes
 from gsisio_jax.study.axes import bare
 from gsisio_jax.study.reduction_base import Context, Kept, Reduction
 from gsisio_jax.study.row_source import Rows
@@ -25,6 +26,11 @@ from gsisio_jax.study.row_source import Rows
 TARGET_BYTES = 256 * 2**20  # working set of a tile
 CHUNK_BYTES = 4 * 2**20  # of a chunk, to stay in the caches of a core
 CHUNKS = 256, 8192  # smallest and largest: every step of a chunk costs some microseconds, however few cases it has
+# Where XLA makes the recursion one function, it is quickest with fewer cases; but it takes longer to compile, which pays
+# from some steps of all cases on.
+WHOLE = 32, 256
+WHOLE_PAYS = 2e8
+NUMBER_BYTES = 6  # that a step touches for every number that its start computes
 # What XLA holds for a step, in sizes of what the scan carries: 6.1 for two states with sines, 3.7 for four with roots
 # (`memory_analysis` of compiled tiles).
 TEMPORARIES = 6
@@ -123,6 +129,28 @@ def _start(
     return carry, carried, jax.tree.map(jnp.asarray, states), out
 
 
+class Outline(NamedTuple):
+    """What is known of a study before anything is compiled.
+
+    Attributes:
+        shapes: of the results of one case.
+        cost: bytes of working set of one case.
+        step: those of them that every step goes through.
+        numbers: that the start computes; 0 where it computes with arrays.
+        turns: steps of a case.
+    """
+
+    shapes: dict[str, jax.ShapeDtypeStruct]
+    cost: float
+    step: float
+    numbers: int
+    turns: int
+
+    def chunk(self, cases: int) -> int:
+        """Cases that one call computes on a CPU, of so many in all."""
+        return whole_chunk(self.numbers, float(cases) * self.turns, loop_bytes()) or chunk_size(self.step)
+
+
 def outline(
     observer: AnyObserver,
     varying: Mapping[str, Any],
@@ -130,33 +158,37 @@ def outline(
     source: Rows,
     reductions: tuple[Reduction, ...],
     hold: bool,
-) -> tuple[dict[str, jax.ShapeDtypeStruct], float, float]:
-    """Shapes of the results of one case, and the bytes that it costs; nothing is compiled.
+) -> Outline:
+    """Shapes of the results of one case, and what it costs; nothing is compiled.
 
     Args:
         varying: arguments of any one case, with a leading axis of 1; the others as in `run_cases`.
-
-    Returns:
-        Shapes, the bytes of working set, and how many of them every step goes through.
     """
 
+    turns = 0
+
     def small(observer: AnyObserver, varying: Any, shared: Any) -> Any:
+        nonlocal turns
         case = eqx.combine(jax.tree.map(lambda a: a[0], varying), shared)
         carry, carried, states, out = _start(observer, case, source, reductions, hold)
+        turns = source.steps(case)
         results: dict[str, Any] = {}
         kept: list[Any] = []
         for reduction, state in zip(reductions, states, strict=True):
             if isinstance(reduction, Kept):
-                state = jax.tree.map(lambda a: jnp.broadcast_to(a, (source.steps(case), *a.shape)), state)
+                state = jax.tree.map(lambda a: jnp.broadcast_to(a, (turns, *a.shape)), state)
                 kept.append(state)
-            count = source.steps(case) if case.get("length") is None else case["length"]
+            count = turns if case.get("length") is None else case["length"]
             results |= reduction.finish(state, count, Context(case["steady"]))
         return results | source.results(carried), (carry, carried, out, states), kept
 
-    results, moving, kept = jax.eval_shape(small, observer, dict(varying), dict(shared))
+    traced, found = jax.make_jaxpr(small, return_shape=True)(observer, dict(varying), dict(shared))
+    results, moving, kept = found
+    numbers = sum(len(eqn.params["program"].operations) for eqn in traced.eqns if "program" in eqn.params)
     # Inputs and kept rows are copied once on their way: the scan wants time first.
     step = TEMPORARIES * _bytes(moving)
-    return results, float(2 * _bytes(varying) + step + 2 * _bytes(kept) + _bytes(results)), float(step)
+    cost = 2 * _bytes(varying) + step + 2 * _bytes(kept) + _bytes(results)
+    return Outline(results, float(cost), float(step), numbers, turns)
 
 
 def tile_size(bytes_per_case: float, cases: int) -> int:
@@ -182,6 +214,23 @@ def chunk_size(bytes_per_step: float) -> int:
     (1024, 256, 8192)
     """
     return min(max(2 ** int(np.log2(max(CHUNK_BYTES / bytes_per_step, 1))), CHUNKS[0]), CHUNKS[1])
+
+
+def whole_chunk(numbers: int, steps: float, loop_bytes: int) -> int:
+    """Cases that one call computes where its recursion is one function; 0 where that does not pay or cannot be.
+
+    Args:
+        numbers: of a step.
+        steps: of all cases together.
+        loop_bytes: that XLA allows such a loop.
+
+    >>> whole_chunk(2500, 1e8, 2**23), whole_chunk(10_000, 1e8, 2**23), whole_chunk(2500, 1e6, 2**23)
+    (256, 64, 0)
+    """
+    if not numbers or steps < WHOLE_PAYS:
+        return 0
+    cases = loop_bytes // (NUMBER_BYTES * numbers)
+    return min(2 ** (cases.bit_length() - 1), WHOLE[1]) if cases >= WHOLE[0] else 0
 
 
 def _bytes(tree: Any) -> int:

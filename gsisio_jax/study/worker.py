@@ -15,7 +15,7 @@ import jax
 
 from gsisio_jax._extras import need
 from gsisio_jax._version import __version__
-from gsisio_jax.scalar.options import fuses, use_flags
+from gsisio_jax.scalar.options import fuses, loop_bytes, use_flags
 from gsisio_jax.study.crew import Crew, configuration, configured
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ class Setting(NamedTuple):
     threefry_partitionable: bool
     matmul_precision: str | None
     fuses: bool
+    loop_bytes: int
 
     @classmethod
     def here(cls) -> Setting:
@@ -47,6 +48,7 @@ class Setting(NamedTuple):
             __version__,
             *configuration(),
             fuses(),
+            loop_bytes(),
         )
 
     @contextlib.contextmanager

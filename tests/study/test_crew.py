@@ -31,7 +31,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 @pytest.fixture
 def chunked(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(job_module, "chunk_size", lambda step: CHUNK)
+    monkeypatch.setattr(kernel, "chunk_size", lambda step: CHUNK)
     monkeypatch.setattr(crew, "usable", lambda: 3)
 
 
@@ -120,21 +120,42 @@ def test_a_chunk_depends_on_the_study_alone():
 
 
 def test_flags_are_added_to_those_that_are_given():
-    (fusion,) = options.FLAGS.values()
-    assert options.extended("") == fusion
-    assert options.extended("--xla_dump_to=/tmp/x ") == f"--xla_dump_to=/tmp/x {fusion}"
-    for given in ("--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=false", "a_file_of_flags"):
-        assert options.extended(given) == given
+    fusion, loops = options.FLAGS.values()
+    assert options.extended("") == f"{fusion} {loops}"
+    assert options.extended("--xla_dump_to=/tmp/x ") == f"--xla_dump_to=/tmp/x {fusion} {loops}"
+    given = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=false"
+    assert options.extended(given) == f"{given} {loops}"
+    assert options.extended("a_file_of_flags") == "a_file_of_flags"
+
+
+def test_the_bytes_of_a_loop_are_those_of_the_flags(monkeypatch):
+    name = "xla_cpu_small_while_loop_byte_threshold"
+    for flags, expected in [
+        ("", 1024),
+        (options.extended(""), options.LOOP_BYTES),
+        (options.extended(f"--xla_backend_extra_options={name}=4096"), 4096),
+    ]:
+        monkeypatch.setenv("XLA_FLAGS", flags)
+        assert options.loop_bytes() == expected
+
+
+def test_long_studies_take_the_chunk_whose_loop_is_one_function():
+    assert kernel.whole_chunk(3000, 4e7, 2**23) == 0, "compiling does not pay"
+    assert kernel.whole_chunk(0, 1e9, 2**23) == 0, "arrays"
+    assert kernel.whole_chunk(3000, 1e9, 1024) == 0, "XLA is not told to"
+    assert kernel.whole_chunk(3000, 1e9, 2**23) == 256
+    assert kernel.whole_chunk(30_000, 1e9, 2**23) == 32
+    assert kernel.whole_chunk(40_000, 1e9, 2**23) == 0, "too few cases for a call"
 
 
 def test_the_command_line_sets_the_flags_in_time():
     """gsisio_jax is imported and JAX has not computed. XLA would end the process if it did not know one."""
     code = "from gsisio_jax.cli import main\ntry: main(['design', 'none'])\nfinally:\n import jax; jax.devices()\n"
-    code += " from gsisio_jax.scalar import options; print(options.fuses(), options.repeated())"
+    code += " from gsisio_jax.scalar import options; print(options.fuses(), options.repeated(), options.loop_bytes())"
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     environment["PYTHONPATH"] = str(Path(gx.__file__).parents[1])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert done.stdout == "True 48\n", done.stderr
+    assert done.stdout == f"True 48 {options.LOOP_BYTES}\n", done.stderr
 
 
 def test_versions_that_are_not_known_are_tried(monkeypatch):
