@@ -62,8 +62,8 @@ def scan(
 def _apart(entries: Sequence[Any]) -> list[Any]:
     """Numbers to be kept, each in a shape of its own: (), (1,), (1, 1) and so on.
 
-    XLA keeps them by writing into arrays over all turns. Arrays of one shape that are written at one place it fuses into
-    one operation with several results, which, where a loop is one function, copies them whole at every turn.
+    XLA keeps them by writing into arrays over all turns. Arrays of one shape that are written at one place it fuses
+    into one operation with several results, which, where a loop is one function, copies them whole at every turn.
     """
     return [jnp.reshape(entry, (1,) * (i % _SHAPES)) for i, entry in enumerate(entries)]
 

@@ -26,8 +26,8 @@ from gsisio_jax.study.row_source import Rows
 TARGET_BYTES = 256 * 2**20  # working set of a tile
 CHUNK_BYTES = 4 * 2**20  # of a chunk, to stay in the caches of a core
 CHUNKS = 256, 8192  # smallest and largest: every step of a chunk costs some microseconds, however few cases it has
-# Where XLA makes the recursion one function, it is quickest with fewer cases; but it takes longer to compile, which pays
-# from some steps of all cases on.
+# Where XLA makes the recursion one function, it is quickest with fewer cases; but it takes longer to compile, which
+# pays from some steps of all cases on.
 WHOLE = 32, 256
 WHOLE_PAYS = 2e8
 NUMBER_BYTES = 6  # that a step touches for every number that its start computes
