@@ -145,7 +145,7 @@ def test_long_studies_take_the_chunk_whose_loop_is_one_function():
     assert kernel.whole_chunk(3000, 1e9, 1024) == 0, "XLA is not told to"
     assert kernel.whole_chunk(3000, 1e9, 2**23) == 256
     assert kernel.whole_chunk(30_000, 1e9, 2**23) == 32
-    assert kernel.whole_chunk(40_000, 1e9, 2**23) == 0, "too few cases for a call"
+    assert kernel.whole_chunk(60_000, 1e9, 2**23) == 0, "too few cases for a call"
 
 
 def test_the_command_line_sets_the_flags_in_time():
