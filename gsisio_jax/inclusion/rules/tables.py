@@ -76,7 +76,7 @@ class PiecewiseLinear:
 
     @property
     def jumps(self) -> tuple[bool, bool]:
-        return self.beyond[0] != self.values[0], self.beyond[1] != self.values[-1]
+        return bool(self.beyond[0] != self.values[0]), bool(self.beyond[1] != self.values[-1])
 
     def _at(self, t: Any) -> tuple[Any, Any]:
         """Value at t, and what its error goes with."""
@@ -97,7 +97,7 @@ class PiecewiseLinear:
         value, size = start + rise, abs(start) + abs(rise)
         for side, tail in zip((-jnp.inf, jnp.inf), self.tails, strict=True):
             if tail:
-                value = jnp.where(t == side, side * np.sign(tail), value)
+                value = jnp.where(t == side, float(side * np.sign(tail)), value)
         return value, jnp.where(finite, size, abs(start))
 
     def _points(self, a: Any, b: Any, s: Any) -> tuple[Any, Any, Any]:
@@ -140,7 +140,7 @@ class PiecewiseLinear:
         for k, side in ((0, jnp.maximum), (1, jnp.minimum)):
             if not any(self.tails):
                 ends = np.append(self.values, self.beyond)
-                end = ends.max() if k else ends.min()
+                end = float(ends.max() if k else ends.min())
                 found = Interval.unchecked(
                     found.lower if k else side(found.lower, end), side(found.upper, end) if k else found.upper
                 )
