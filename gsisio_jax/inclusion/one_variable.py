@@ -88,10 +88,10 @@ def _match(
     entries = arrays[out].ravel()
     if out not in moving or not 0 < len(entries) <= _MOST_ENTRIES or not jnp.issubdtype(out.aval.dtype, jnp.floating):
         return None
-    read = [bends.of(entry) for entry in entries]
-    if any(bent is None for bent in read) or not any(bent.joint for bent in read if bent is not None):
+    read = [bent for entry in entries if (bent := bends.of(entry)) is not None]
+    if len(read) < len(entries) or not any(bent.joint for bent in read):
         return None
-    bases = sorted({b for bent in read if bent is not None for b in bent.bases()})
+    bases = sorted({b for bent in read for b in bent.bases()})
     # A number that is first seen inside of a call, or in this result itself, is no variable to start from.
     if not all(b in where and where[b][0] is not out and where[b][0] in moving for b in bases):
         return None

@@ -69,7 +69,7 @@ class _Reader:
     table."""
 
     def __init__(self, n: int, inputs: list[np.ndarray], *dtypes: Any, bends: Bends | None = None):
-        self.bends, self.tables = bends, dict[Any, Linear]()
+        self.joins, self.bends, self.tables = bends is not None, bends or Bends(), dict[Any, Linear]()
         self.n, self.atoms, self.dtypes = n, [], [np.dtype(dtype) for dtype in dtypes]
         self.read: dict[int, Linear] = {id(x): Linear({i: Fraction(1)}) for i, x in enumerate(inputs[0])}
         for j, u in enumerate(inputs[1]):
@@ -113,18 +113,22 @@ class _Reader:
             if id(number) in self.read:
                 stack.pop()
                 continue
-            bent = None if self.bends is None else self.bends.of(number)
-            joint = bent is not None and bent.joint
-            operands = [self.bends.numbers[b] for b in bent.bases()] if joint else number.operands
+            bent = self._joint(number)
+            operands = number.operands if bent is None else [self.bends.numbers[b] for b in bent.bases()]
             waiting = [v for v in operands if isinstance(v, Number) and id(v) not in self.read]
             if waiting:
                 stack += waiting
             else:
-                found = self._of_tables(bent) if joint else self._one(number)
+                found = self._one(number) if bent is None else self._of_tables(bent)
                 if found is None:
                     return None
                 self.read[id(number)] = found
         return self.read[id(value)]
+
+    def _joint(self, number: Number) -> Bent | None:
+        """A number that bends several times along one direction."""
+        bent = self.bends.of(number) if self.joins else None
+        return bent if bent is not None and bent.joint else None
 
     def _of_tables(self, bent: Bent) -> Linear:
         """Linear terms, and an atom for every direction along which a number bends."""
