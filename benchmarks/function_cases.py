@@ -74,6 +74,10 @@ def _pairs() -> dict[str, Case]:
 
 def _tables() -> dict[str, Case]:
     return {
+        "sum of 49 clips": (
+            lambda x: jnp.sum(jnp.clip(x[:, None], KNOTS[:-1], KNOTS[1:]) * jnp.diff(TABLE), -1),
+            ([0.42, 0.1], [0.44, 0.9]),
+        ),
         "interp, 50 knots": (lambda x: jnp.interp(x, KNOTS, TABLE), ([0.42, 0.1], [0.44, 0.9])),
         "interp, 4 knots": (lambda x: jnp.interp(x, FEW, VALUES), ([-0.5, 0.35], [1.5, 0.55])),
         "interp, left and right": (lambda x: jnp.interp(x[0], FEW, VALUES, left=-1.0, right=3.0), ([-0.5], [1.5])),

@@ -10,6 +10,8 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.plant.system import Noise, System
 
+_MOST_CELLS = 10_000
+
 
 def checked(
     system: System,
@@ -83,3 +85,18 @@ def checked(
     if u_region.shape != (system.m,):
         raise ValueError(f"design_observer: `u_region` must have shape ({system.m},), got {u_region.shape}")
     return (region if isinstance(region, Interval) else None), u_region
+
+
+def check_cells(cells: Any, form: str) -> None:
+    """`cells` is a number of parts that a step can be expected to bound one by one.
+
+    Raises:
+        ValueError: it is not.
+    """
+    whole = isinstance(cells, int | np.integer) and not isinstance(cells, bool)
+    if not whole or not 1 <= cells <= _MOST_CELLS:
+        raise ValueError(
+            f"design_observer: `cells` must be a whole number, 1 (the box as a whole) to {_MOST_CELLS}, got {cells!r}"
+        )
+    if cells > 1 and form == "prediction":
+        raise ValueError(f"design_observer: `cells` must be 1 in the prediction form, which uses no y[k], got {cells}")

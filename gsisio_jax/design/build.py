@@ -8,7 +8,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 
-from gsisio_jax.design.arguments import checked
+from gsisio_jax.design.arguments import check_cells, checked
 from gsisio_jax.design.assemble import Plan, assemble
 from gsisio_jax.design.dead_beat import dead_beat_rows
 from gsisio_jax.design.delay import check_delay, design_delayed, with_delay
@@ -34,6 +34,7 @@ from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.cells import counts
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
 from gsisio_jax.observer.prediction_step import PredictionObserver
@@ -59,6 +60,7 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = 1,
     delay: Literal[0] = 0,
+    cells: int = 1,
 ) -> Observer: ...
 
 
@@ -77,6 +79,7 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = 1,
     delay: int | Literal["auto"],
+    cells: int = 1,
 ) -> Observer | DelayedObserver: ...
 
 
@@ -111,6 +114,7 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = 1,
     delay: int | Literal["auto"] = 0,
+    cells: int = 1,
 ) -> Observer | PredictionObserver | DelayedObserver:
     """Design the gains of an interval observer offline, and certify the width of its boxes.
 
@@ -147,6 +151,9 @@ def design_observer(
             positions are measured), or to smooth. Outputs, but for those of step k, must be affine in the state, and
             so must be for L >= 2 the parts of f that they see. "auto" takes the smallest L up to n that shows every
             unknown input. The result is a `DelayedObserver`; online its boxes come L steps late.
+        cells: current form: into about how many parts the box of x[k] is cut in every step where outputs are bent, to
+            bound them part by part: 64 finds a position by ranges and bearings in a box as large as the distances,
+            where one part may leave it as wide as the state bounds. 1 takes the box whole.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
@@ -162,6 +169,7 @@ def design_observer(
 
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
+    check_cells(cells, form)
     given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
     if check_delay(delay, system, form):
 
@@ -169,6 +177,7 @@ def design_observer(
             return design_observer(
                 plant, noise, region, gains=1 if quick else gains, u_region=u_region, missing=missing and not quick,
                 sweeps=sweeps, bounds=bounds, certify=certify and not quick, window=1 if quick else window, delay=0,
+                cells=1 if quick else cells,
             )  # fmt: skip
 
         return design_delayed(inner, system, noise, given, u_region, delay)
@@ -200,6 +209,7 @@ def design_observer(
     if not everywhere.affine and (why := undefined_in(system, box, u_region)):
         certificate = observer.certificate
         observer = replace(observer, certificate=replace(certificate, notes=(*certificate.notes, why)))
+    observer = replace(observer, cells=counts(cells, everywhere.bent_outputs))
     if window != 1:
         rows = window_rows(problem, window, width)
         observer = replace(observer, window=rows)

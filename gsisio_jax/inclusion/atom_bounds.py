@@ -199,6 +199,8 @@ def _curve(atom: Atom) -> Any:
     """The function of one variable that an atom is, None for others."""
     if atom.name == "reciprocal":
         return RECIPROCAL
+    if atom.name == "table":
+        return atom.equation
     if atom.name == "mul":
         return SQUARE if atom.arguments[0] is atom.arguments[1] else None
     if atom.name == "integer_pow" and atom.equation.params["y"] not in (0, 1):

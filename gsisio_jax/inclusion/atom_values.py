@@ -100,6 +100,8 @@ def rule(atom: Atom, nodes: list[Any]) -> Node:
     """The atom by the rules of the engine over arrays."""
     if atom.name == "reciprocal":
         return apply(RECIPROCAL, nodes[0])
+    if atom.name == "table":
+        return apply(atom.equation, nodes[0])
     if atom.name == "mul":
         return apply(SQUARE, nodes[0]) if atom.arguments[0] is atom.arguments[1] else multiply(*nodes)
     return ELEMENTWISE[atom.name](atom.equation, *nodes)

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from gsisio_jax.inclusion import one_variable
 from gsisio_jax.inclusion.form_arithmetic import fold, is_known, known_if_concrete
 from gsisio_jax.inclusion.node import (
     POINT_MODE,
@@ -67,10 +68,16 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
         aval: Any = atom.aval
         return np.asarray(atom.val, aval.dtype)
 
-    known = patterns.find(jaxpr)
+    known, needed = patterns.find(jaxpr), None
+    bent = one_variable.find(jaxpr, values)
+    if bent:
+        known = known | bent
+        needed = one_variable.needed(jaxpr, known)
     for place, eqn in enumerate(jaxpr.eqns):
+        if needed is not None and place not in needed:
+            continue
         try:
-            operands, rule = [read(atom) for atom in eqn.invars], None
+            operands, rule = [read(atom) for atom in eqn.invars if place not in bent], None
             match = known.get(place) if eqn.primitive.name not in _BY_HAND else None
             given = [read(atom) for atom in match.operands] if match is not None else []
             out = _recognised(match, given)

@@ -28,7 +28,10 @@ class Linear:
 
 @dataclass
 class Atom:
-    """An operation that is not linear: its primitive and arguments; or the entry `source` of the known input."""
+    """An operation that is not linear: its primitive and arguments; or the entry `source` of the known input.
+
+    A "table" is a piecewise-linear function of its argument; it stands in the place of the equation.
+    """
 
     name: str
     equation: Any

@@ -15,7 +15,9 @@ from jax.core import Tracer
 from gsisio_jax.inclusion.expansion import Expansion
 from gsisio_jax.inclusion.linear_parts import Atom, Linear
 from gsisio_jax.inclusion.rules.functions import CURVES
+from gsisio_jax.inclusion.rules.hinge_tables import hinge_table
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
+from gsisio_jax.scalar.hinges import BENT, Bends, Bent, Direction
 from gsisio_jax.scalar.unroll import collected, evaluate, numbers_in
 
 _MOST_NUMBERS = 100_000  # that `affine_rows` reads
@@ -33,7 +35,7 @@ def expand(function: Callable[..., Any], n: int, m: int, dtype: Any) -> Expansio
     if any(isinstance(const, Tracer) for const in closed.consts):
         return None
     (out,) = evaluate(graph, closed.jaxpr, closed.consts, inputs)
-    return _Reader(n, inputs, dtype).expansion(out)
+    return _Reader(n, inputs, dtype, bends=Bends() if graph.count(BENT) > 1 else None).expansion(out)
 
 
 @dataclass(frozen=True)
@@ -63,9 +65,11 @@ _KNOWN = {"mul", "div", "integer_pow", "square", "pow", "atan2", "max", "min", "
 
 
 class _Reader:
-    """Reads numbers into linear combinations of atoms."""
+    """Reads numbers into linear combinations of atoms; with `bends`, what is piecewise linear in one of them as one
+    table."""
 
-    def __init__(self, n: int, inputs: list[np.ndarray], *dtypes: Any):
+    def __init__(self, n: int, inputs: list[np.ndarray], *dtypes: Any, bends: Bends | None = None):
+        self.joins, self.bends, self.tables = bends is not None, bends or Bends(), dict[Any, Linear]()
         self.n, self.atoms, self.dtypes = n, [], [np.dtype(dtype) for dtype in dtypes]
         self.read: dict[int, Linear] = {id(x): Linear({i: Fraction(1)}) for i, x in enumerate(inputs[0])}
         for j, u in enumerate(inputs[1]):
@@ -106,17 +110,43 @@ class _Reader:
         stack = [value]
         while stack:
             number = stack[-1]
-            waiting = [v for v in number.operands if isinstance(v, Number) and id(v) not in self.read]
             if id(number) in self.read:
                 stack.pop()
-            elif waiting:
+                continue
+            bent = self._joint(number)
+            operands = number.operands if bent is None else [self.bends.numbers[b] for b in bent.bases()]
+            waiting = [v for v in operands if isinstance(v, Number) and id(v) not in self.read]
+            if waiting:
                 stack += waiting
             else:
-                found = self._one(number)
+                found = self._one(number) if bent is None else self._of_tables(bent)
                 if found is None:
                     return None
                 self.read[id(number)] = found
         return self.read[id(value)]
+
+    def _joint(self, number: Number) -> Bent | None:
+        """A number that bends several times along one direction."""
+        bent = self.bends.of(number) if self.joins else None
+        return bent if bent is not None and bent.joint else None
+
+    def _of_tables(self, bent: Bent) -> Linear:
+        """Linear terms, and an atom for every direction along which a number bends."""
+        rest, tables = bent.tables()
+        total = self._combined(tuple(rest.linear.items())).plus(Linear({}, rest.constant))
+        for direction, slope, constant, jumps in tables:
+            key = direction, slope, constant, tuple(sorted(jumps.items()))
+            if key not in self.tables:
+                table = hinge_table(slope, constant, jumps, self.dtypes[0])
+                self.tables[key] = self._atom(Atom("table", table, (self._combined(direction),)))
+            total = total.plus(self.tables[key])
+        return total
+
+    def _combined(self, weights: Direction) -> Linear:
+        total = Linear()
+        for b, weight in weights:
+            total = total.plus(self.read[id(self.bends.numbers[b])].times(weight))
+        return total
 
     def _one(self, number: Number) -> Linear | None:
         name = number.name

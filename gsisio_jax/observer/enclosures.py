@@ -43,6 +43,11 @@ class Slopes(eqx.Module):
         return all((x <= 1e-12 * max(size, 1.0)).all() for x in radii)
 
     @property
+    def bent_outputs(self) -> np.ndarray:
+        """(n,): in which states T2 g is not affine."""
+        return np.array([not self.near_affine(column) for column in self.Z_radius.T], bool)
+
+    @property
     def affine(self) -> bool:
         """f and g are affine there."""
         return self.near_affine(self.F_radius, self.E_radius, self.Z_radius)

@@ -126,6 +126,7 @@ class Observer(eqx.Module):
         window: rows over several steps (`observer.window.Window`), or None.
         recovery: rows that need no box to begin with (`observer.recovery.Recovery`), or None.
         corrections: Newton steps to the point that the certified bound is around (theory 5.6).
+        cells: into how many parts the box of every state is cut for the outputs (`observer.cells`); () for none.
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
     """
 
@@ -153,6 +154,7 @@ class Observer(eqx.Module):
     window: Any = None
     recovery: Any = None
     corrections: int = eqx.field(static=True, default=0)
+    cells: tuple[int, ...] = eqx.field(static=True, default=())
     rounding: Rounding = eqx.field(static=True, default="outward")
 
     @property

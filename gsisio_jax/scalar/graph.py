@@ -44,6 +44,10 @@ class Graph:
         self._made = 0
         self.stage = ""
 
+    def count(self, names: set[str]) -> int:
+        """How many numbers these primitives make."""
+        return sum(number.name in names for number in self._found.values())
+
     def input(self, dtype: Any) -> Number:
         return self._ordered(Number("input", (), None, dtype, False, ""))
 

@@ -77,11 +77,12 @@ def evaluate(graph: Graph, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any
 
     for eqn in jaxpr.eqns:
         stage = f"{scope}/{eqn.source_info.name_stack}".strip("/")
-        values.update(zip(eqn.outvars, _result(graph, eqn, [read(atom) for atom in eqn.invars], stage), strict=True))
+        values.update(zip(eqn.outvars, applied(graph, eqn, [read(atom) for atom in eqn.invars], stage), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _result(graph: Graph, eqn: Any, args: list[Any], stage: str) -> Sequence[Any]:
+def applied(graph: Graph, eqn: Any, args: list[Any], stage: str) -> Sequence[Any]:
+    """Results of one equation for arrays of numbers."""
     name = eqn.primitive.name
     if name in _CALLS:
         return evaluate(graph, *called_jaxpr(eqn), args, stage)

@@ -27,7 +27,7 @@ from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose
 
 
-def _whole(fn: Callable[..., Any]) -> Callable[..., Any]:
+def whole(fn: Callable[..., Any]) -> Callable[..., Any]:
     """A method of arrays a and b that programs of single numbers (`gsisio_jax.scalar`) keep as an operation on arrays:
     they would write out every knot."""
 
@@ -69,14 +69,14 @@ class PiecewiseLinear:
         t, v = [Fraction(float(x)) for x in knots], [Fraction(float(x)) for x in values]
         slopes = [(v[i + 1] - v[i]) / (t[i + 1] - t[i]) for i in range(len(t) - 1)] or [Fraction(0)]
         exact = [slopes[0], *slopes, slopes[-1]] if extrapolates else [Fraction(0), *slopes, Fraction(0)]
-        low, high = (np.array([_near(slope, side, knots.dtype) for slope in exact]) for side in (-1, 1))
+        low, high = (np.array([near(slope, side, knots.dtype) for slope in exact]) for side in (-1, 1))
         tails = (float(exact[0]), float(exact[-1]))
         beyond = (float(values[0]), float(values[-1])) if beyond is None else beyond
         return cls(knots, values, tails, beyond, low, high)
 
     @property
     def jumps(self) -> tuple[bool, bool]:
-        return self.beyond[0] != self.values[0], self.beyond[1] != self.values[-1]
+        return bool(self.beyond[0] != self.values[0]), bool(self.beyond[1] != self.values[-1])
 
     def _at(self, t: Any) -> tuple[Any, Any]:
         """Value at t, and what its error goes with."""
@@ -97,7 +97,7 @@ class PiecewiseLinear:
         value, size = start + rise, abs(start) + abs(rise)
         for side, tail in zip((-jnp.inf, jnp.inf), self.tails, strict=True):
             if tail:
-                value = jnp.where(t == side, side * np.sign(tail), value)
+                value = jnp.where(t == side, float(side * np.sign(tail)), value)
         return value, jnp.where(finite, size, abs(start))
 
     def _points(self, a: Any, b: Any, s: Any) -> tuple[Any, Any, Any]:
@@ -133,28 +133,31 @@ class PiecewiseLinear:
         upper = jnp.maximum(bounds.upper, jnp.where(inside, high, -jnp.inf).max(-1))
         return Interval.unchecked(lower, upper)
 
-    @_whole
+    @whole
     def range(self, a: Any, b: Any) -> Interval:
         found = self._extremes(a, b, None)
         # Without tails that grow no value lies beyond those of the table.
         for k, side in ((0, jnp.maximum), (1, jnp.minimum)):
             if not any(self.tails):
                 ends = np.append(self.values, self.beyond)
-                end = ends.max() if k else ends.min()
+                end = float(ends.max() if k else ends.min())
                 found = Interval.unchecked(
                     found.lower if k else side(found.lower, end), side(found.upper, end) if k else found.upper
                 )
         return found
 
-    @_whole
-    def derivative(self, a: Any, b: Any) -> Interval:
+    def met(self, a: Any, b: Any) -> Any:
+        """Which segments [a, b] reaches into, (..., K + 1)."""
         left = np.append(-np.inf, self.knots)
         right = np.append(self.knots, np.inf)
         a, b = a[..., None], b[..., None]
-        met = (left < b) & (a < right) | (a == b) & (left <= b) & (a <= right)
+        return (left < b) & (a < right) | (a == b) & (left <= b) & (a <= right)
+
+    @whole
+    def derivative(self, a: Any, b: Any) -> Interval:
+        met = self.met(a, b)
         lower = jnp.where(met, self.low, jnp.inf).min(-1)
         upper = jnp.where(met, self.high, -jnp.inf).max(-1)
-        a, b = a[..., 0], b[..., 0]
         for jump, over in zip(
             self.jumps, ((a < self.knots[0]) & (b >= self.knots[0]), (a <= self.knots[-1]) & (b > self.knots[-1])),
             strict=True,
@@ -167,7 +170,7 @@ class PiecewiseLinear:
         s, rest, usable = self._line(a, b)
         return s, choose(usable, rest, natural)
 
-    @_whole
+    @whole
     def _line(self, a: Any, b: Any) -> tuple[Any, Interval, Any]:
         """The slope is that of the secant; next to an infinite end that of its tail, with which the rest is bounded."""
         low, high = jnp.isfinite(a), jnp.isfinite(b)
@@ -191,14 +194,15 @@ class PiecewiseLinear:
         for end, k in ((low, 0), (high, 1)):
             # The tail's slope is that of a segment, to within its rounding: times infinity, that is no bound.
             exact = self.low[-k] == self.high[-k] == self.tails[k]
-            usable &= end | exact
+            usable &= end | (exact or not rounding.outward())
         return jnp.where(usable, s, 0), rest, usable
 
 
-def _near(slope: Fraction, side: int, dtype: Any) -> Any:
-    """The next floating number on that side of a fraction; itself where it is one."""
+def near(slope: Fraction, side: int, dtype: Any) -> Any:
+    """The next floating number on that side of a fraction; itself where it is one. Tables outlive the kind of rounding
+    that they were made under, so it does not matter here."""
     number = np.asarray(float(slope), dtype)[()]
-    if not rounding.outward() or Fraction(float(number)) == slope:
+    if Fraction(float(number)) == slope:
         return number
     wrong = Fraction(float(number)) > slope if side < 0 else Fraction(float(number)) < slope
     return np.nextafter(number, np.asarray(side * np.inf, dtype)) if wrong else number

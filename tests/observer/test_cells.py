@@ -1,0 +1,72 @@
+"""A position from ranges and a bearing, in a box as large as the distances: cut into cells, against the set itself."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gsisio_jax as gx
+from gsisio_jax import Interval
+from gsisio_jax.observer.cells import counts
+
+BEACONS = 30 * np.array([[1.0, 0.0], [0.0, 1.0], [-0.8, -0.7]])  # m
+NOISE = np.array([0.05, 0.05, 0.05, 0.02])  # m, and rad
+STEPS, LOST, WRONG = 30, 12, 20
+
+
+def _outputs(x):
+    away = BEACONS - x
+    return [*jnp.hypot(away[:, 0], away[:, 1]), jnp.arctan2(away[0, 1], away[0, 0])]
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A position that moves by an unknown velocity; nothing but y[k] says where it is."""
+    system = gx.System(
+        lambda x: x, _outputs, G=0.1 * np.eye(2), H=np.zeros((4, 2)), state_bounds=Interval.symmetric([20.0, 20.0])
+    )
+    noise = gx.Noise(Interval.symmetric([0.002, 0.002]), Interval.symmetric(NOISE))
+    observer = gx.design_observer(system, noise, Interval.symmetric([10.0, 10.0]), missing=False, sweeps=2, cells=64)
+    assert observer.cells == (8, 8)
+    generator = np.random.default_rng(0)
+    x = np.array([6.0, -3.0]) + np.cumsum(generator.uniform(-1, 1, (STEPS, 2)), axis=0)
+    y = np.array([np.asarray(_outputs(row)) for row in x]) + generator.uniform(-1, 1, (STEPS, 4)) * NOISE
+    y[LOST, 1] = np.nan
+    y[WRONG, 0] += 5.0
+    return x, y, gx.estimate(observer, Interval.entire(2), y)
+
+
+def _hull(y, around):
+    """Widths of the set of positions that agree with y, on a grid of 2 mm."""
+    grid = np.arange(-0.25, 0.25, 0.002)
+    px, py = np.meshgrid(around[0] + grid, around[1] + grid, indexing="ij")
+    away = [np.stack([b[0] - px, b[1] - py]) for b in BEACONS]
+    seen = [*(np.hypot(*a) for a in away), np.arctan2(away[0][1], away[0][0])]
+    agrees = np.all([~(abs(s - value) > bound) for s, value, bound in zip(seen, y, NOISE, strict=True)], axis=0)
+    return np.ptp(px[agrees]), np.ptp(py[agrees])
+
+
+def test_boxes_are_near_the_set_that_agrees(run):
+    x, y, found = run
+    for k in range(STEPS):
+        if k in (LOST, WRONG):
+            continue
+        # At k = WRONG + 1 a conflict may still be felt in d, not in x: y[k] alone says all.
+        assert (found.state.lower[k] <= x[k]).all()
+        assert (x[k] <= found.state.upper[k]).all()
+        assert (np.asarray(found.state.width[k]) <= 1.5 * np.array(_hull(y[k], x[k])) + 0.002).all(), k
+
+
+def test_a_lost_range_widens_and_a_wrong_one_is_found(run):
+    x, _, found = run
+    assert (found.state.lower[LOST] <= x[LOST]).all()
+    assert (x[LOST] <= found.state.upper[LOST]).all()
+    assert np.flatnonzero(np.asarray(found.status) & gx.Status.CONFLICT).tolist() == [WRONG]
+
+
+def test_only_bent_states_are_cut():
+    assert counts(64, np.array([True, True, False])) == (8, 8, 1)
+    assert counts(64, np.array([True, True, True])) == (4, 4, 4)
+    assert counts(1, np.array([True])) == ()
+    assert counts(64, np.array([False, False])) == ()
