@@ -68,10 +68,3 @@ def test_simulated_runs_meet_their_own_boxes(observer):
     assert (data["input_coverage"] == 1).all()
     assert np.isnan(data["broken_at"]).all()
     assert (data["state_width_final"] <= np.asarray(observer.certificate.steady_width) * (1 + 1e-9)).all()
-
-
-def test_a_record_needs_a_step_with_all_measurements(observer):
-    with pytest.raises(ValueError, match=r"sweep: .*1 step later, so records must have at least 2 rows; got 1"):
-        gx.sweep(observer, FIRST, np.zeros((1, 1)))
-    with pytest.raises(ValueError, match=r"monte_carlo: .*at least 2 rows; got 1"):
-        gx.monte_carlo(observer, 0, 5, 1, FIRST)
