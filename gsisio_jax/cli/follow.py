@@ -47,7 +47,7 @@ def follow(options: argparse.Namespace, path: Path, config: Config, part: TableP
             problem = build_problem(config, path.name)
             stepper = Stepper(problem, config.estimate.on_conflict)
             print(f"gsisio: following {tail.name}", file=sys.stderr, flush=True)
-            for rows in stepper.rows(to_the_end(on_grid(_rows(tail, part)), stepper.delay)):
+            for rows in stepper.rows(on_grid(_rows(tail, part))):
                 sys.stdout.writelines(f"{text}\n" for text in stepper.lines(rows, steps))
                 sys.stdout.flush()
                 steps += len(rows)
@@ -80,7 +80,7 @@ class Stepper:
     def rows(self, tables: Iterator[Table]) -> Iterator[np.ndarray]:
         """Records of the rows, as they are finished: with a delay of L these are the rows of L steps before."""
         waiting = np.empty(0, self.kind)
-        for table in tables:
+        for table in to_the_end(tables, self.delay):
             for rows in self._feed(table):
                 if not self.delay:
                     yield rows

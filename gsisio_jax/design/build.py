@@ -223,17 +223,10 @@ def design_observer(
     maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
     if maps is not None:
         observer = replace(observer, recovery=dead_beat_rows(problem, maps, width))
+    slices = observer.certificate.slices
     observer = with_rounding_constants(
-        observer,
-        system,
-        first.slopes,
-        everywhere,
-        outputs,
-        slack,
-        maps,
-        np.float64,
-        observer.certificate.slices,
-    )
+        observer, system, first.slopes, everywhere, outputs, slack, maps, np.float64, slices
+    )  # fmt: skip
     if certify:
         check_initial_contraction(problem, bank[0], observer, outputs)
     if not missing:

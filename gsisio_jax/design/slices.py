@@ -78,7 +78,7 @@ def _even_edges(slopes: Slopes, region: Interval, count: int) -> np.ndarray:
 
 def _varies(slices: Slices) -> np.ndarray:
     """States along which a slope differs from slice to slice, (n,)."""
-    used = (np.diff(slices.edges) > 0)[None]
+    used = (slices.edges[:, 1:] > slices.edges[:, :-1])[None]
     sides = (slices.rising, slices.falling)
     spread = [np.where(used, d, -np.inf).max(-1) - np.where(used, d, np.inf).min(-1) for d in sides]
     return (np.maximum(*spread) > 1e-9 * np.maximum(*sides).max(initial=0.0)).any(0)
@@ -92,7 +92,7 @@ def _merged(thin: Slices, count: int) -> Slices:
     for j in range(n):
         ends = list(thin.edges[j])
         parts = list(np.stack([thin.rising[:, j], thin.falling[:, j]]).transpose(2, 0, 1))
-        lengths = list(np.diff(ends))
+        lengths = [b - a if b > a else 0.0 for a, b in pairwise(ends)]
         while len(parts) > count:
             joined = [np.maximum(a, b) for a, b in pairwise(parts)]
             costs = [

@@ -126,7 +126,7 @@ class Certificate(eqx.Module):
         if not self.certified:
             return np.full(np.shape(added), np.inf)
         settled = np.full(np.shape(added), np.inf)
-        if self.rate < 1:
+        if self.slices is None or self.rate < 1:
             settled = added @ np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit).T
         if self.slices is not None:
             return self.slices.settled(np.minimum(settled, self.region.width), self._inverse, added)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import systems
@@ -109,6 +110,22 @@ def test_widths_settle_where_the_largest_slope_alone_promises_nothing(tmp_path):
     again = gx.load_observer(cut.save(tmp_path / "cut.npz") or tmp_path / "cut.npz", system)
     np.testing.assert_array_equal(again.certificate.widths(noise), cut.certificate.widths(noise))
     np.testing.assert_array_equal(again.rounding_constants.slices.rising, cut.rounding_constants.slices.rising)
+
+
+def test_a_state_without_bounds_has_one_slice():
+    """x1 turns without end; the slope on x2 varies. The promise is that of one step, repeated."""
+    system = gx.System(
+        lambda x: jnp.stack([0.5 * x[0] + 0.1 * x[1] ** 2, 0.9 * x[1] - 0.05 * x[1] ** 3]), lambda x: 0 * x[:1],
+        G=np.zeros((2, 0)), H=np.zeros((1, 0)),
+    )  # fmt: skip
+    noise = gx.Noise(Interval.symmetric([0.01, 0.05]), Interval.symmetric([0.1]))
+    region = Interval([-np.inf, -1.0], [np.inf, 1.0])
+    plain, cut = (gx.design_observer(system, noise, region, missing=False, split=s).certificate for s in (1, 8))
+    assert (cut.steady_width < 0.999 * plain.steady_width).all()
+    np.testing.assert_allclose(cut.next_width(cut.steady_width, noise), cut.steady_width, rtol=1e-6)
+    # The slope of x1 on x2 changes its sign: half an interval of the steepest part, twice.
+    part = cut.slices.growth(np.array([0.0, 0.4]))[0]
+    assert 0.2 * 2 * 0.1 * 0.9 * 2 < part <= 0.4 * 0.2 + 1e-9
 
 
 def test_an_affine_plant_needs_no_slices():
