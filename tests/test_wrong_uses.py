@@ -71,11 +71,8 @@ def observer():
 
 @pytest.fixture(scope="module")
 def objects(observer):
-    fast = {"missing": False, "sweeps": 1, "delay": 1}
-    bent = System(lambda x: 0.5 * jnp.sin(x), g, G=G, H=H)
     return SimpleNamespace(
-        delayed=gx.design_observer(observer.system, NOISE, BOX, **fast),
-        curved=gx.design_observer(bent, NOISE, BOX, **fast),
+        delayed=gx.design_observer(observer.system, NOISE, BOX, missing=False, sweeps=1, delay=1),
         observer=observer,
         system=observer.system,
         with_u=System(f_of_u, g, G=G, H=H, m=1),
@@ -209,6 +206,9 @@ SWAPPED = {
     "delay negative": (design(NOISE, BOX, delay=-1), "design_observer: `delay`", "whole number", '"auto"', "-1"),
     "delay a fraction": (design(NOISE, BOX, delay=1.0), "design_observer: `delay`", "whole number"),
     "delay a word": (design(NOISE, BOX, delay="yes"), "design_observer: `delay`", '"auto"', "'yes'"),
+    "split of none": (design(NOISE, BOX, split=0), "design_observer: `split`", "number of slices", '"auto"', "got 0"),
+    "split a word": (design(NOISE, BOX, split="yes"), "design_observer: `split`", '"auto"', "'yes'"),
+    "split predicted": (design(NOISE, BOX, "prediction", split=4), "design_observer: `split` must be 1", "got 4"),
     "delay predicted": (
         design(NOISE, BOX, "prediction", delay=1),
         "design_observer: `delay` must be 0 in the prediction form",
@@ -218,12 +218,14 @@ SWAPPED = {
         "design_observer: `delay` must be 0",
         "numpy.unwrap",
     ),
-    "delay in a sweep": (lambda o: gx.sweep(o.delayed, BOX, Y), "sweep: the observer has a delay", "jax.vmap"),
-    "delay in a run": (
-        lambda o: gx.monte_carlo(o.delayed, 0, 4, 3, BOX),
-        "monte_carlo: the observer has a delay",
-        "jax.vmap",
+    "delay in a sweep": (
+        lambda o: gx.sweep(o.delayed, BOX, Y[:1]),
+        "sweep: ",
+        "1 step later",
+        "at least 2 rows",
+        "got 1",
     ),
+    "delay in a run": (lambda o: gx.monte_carlo(o.delayed, 0, 4, 1, BOX), "monte_carlo: ", "at least 2 rows", "got 1"),
     "delay tuned": (
         lambda o: gx.tune_noise(o.delayed, o.records),
         "tune_noise: `observer`",
@@ -237,7 +239,6 @@ SWAPPED = {
         "DelayedObserver",
     ),
     "y lifted": (lambda o: gx.estimate(o.delayed, BOX, np.zeros((3, 2))), "estimate", "shape (T, 1)", "got (3, 2)"),
-    "delay, curved": (lambda o: gx.tightness(o.curved, BOX, Y), "tightness: f or g is not affine", "delay"),
     "window a fraction": (design(NOISE, BOX, window=2.0), "design_observer: `window`", "whole number"),
     "missing a word": (design(NOISE, BOX, missing="no"), "design_observer: `missing`", "True or False", "'no'"),
     "certify a number": (design(NOISE, BOX, certify=1.0), "design_observer: `certify`", "True or False"),

@@ -53,10 +53,14 @@ class Boxes:
         kind: `record_type`.
         spill: called once, when there are more than `limit` rows: the file that takes them; else they stay in memory.
         limit: rows that stay in memory.
+        delay: L: what the observer says at a row is of L rows before, and the last L rows only finish the record.
     """
 
-    def __init__(self, kind: np.dtype, spill: Callable[[], Path] | None = None, limit: int | None = None):
+    def __init__(
+        self, kind: np.dtype, spill: Callable[[], Path] | None = None, limit: int | None = None, delay: int = 0
+    ):
         self.kind, self._spill, self._limit = kind, spill, IN_MEMORY if limit is None else limit
+        self.delay = delay
         self._rows: list[np.ndarray] = []
         self._path = Path()
         self._file: Any = None
@@ -64,6 +68,11 @@ class Boxes:
 
     def __len__(self) -> int:
         return self._count
+
+    @property
+    def steps(self) -> int:
+        """Rows of the record that are finished."""
+        return max(self._count - self.delay, 0)
 
     @property
     def on_disk(self) -> bool:
@@ -116,15 +125,17 @@ class Boxes:
         return np.fromfile(self._path, self.kind, end - begin, offset=begin * self.kind.itemsize)
 
     def parts(self, size: int = PART) -> Iterator[np.ndarray]:
-        """All rows, some at a time, with the input boxes at the step of the input: that of the last row is NaN.
+        """All finished rows, some at a time, every box at its own step: that of the input at the last row is NaN.
 
         There is one part where all rows are in memory.
         """
-        size = size if self.on_disk else max(self._count, 1)
-        for begin in range(0, self._count, size):
-            rows = self.read(begin, begin + size + 1)
-            part = rows[:size].copy()
+        size, steps, delay = size if self.on_disk else max(self.steps, 1), self.steps, self.delay
+        for begin in range(0, steps, size):
+            rows = self.read(begin, begin + size + delay + 1)
+            part = rows[: min(size, steps - begin)].copy()
+            for name in ("state_lower", "state_upper", "status", "margin", "source"):
+                part[name] = rows[name][delay : delay + len(part)]
             for side in ("input_lower", "input_upper"):
-                later = rows[side][1 : size + 1]
+                later = rows[side][delay + 1 : delay + 1 + len(part)]
                 part[side][: len(later)], part[side][len(later) :] = later, np.nan
             yield part

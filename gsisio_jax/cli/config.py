@@ -71,6 +71,8 @@ class DesignPart(Part):
     missing: bool | None = None
     sweeps: Annotated[int, Field(ge=1)] | None = None
     window: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
+    split: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
+    delay: Annotated[int, Field(ge=0)] | Literal["auto"] | None = None
     bounds: Annotated[list[str], Field(min_length=1)] | None = None
     form: Literal["current", "prediction"] | None = None
     left_inverse: Literal["pseudo", "feedthrough", "smallest"] | None = None

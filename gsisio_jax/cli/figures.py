@@ -23,9 +23,10 @@ def run_figures(
 
     Returns:
         ``title``, ``library``, ``steps``, ``time`` (first and last, seconds), ``missing`` (rows without any and with
-        some entries missing), ``statuses`` (steps by bit), ``resumed`` (steps taken from an interrupted run),
-        ``seconds``, ``table`` (what was found in the file and is not plain), ``signals``, ``alarms`` (as in the NetCDF
-        file, the first 10,000), ``alarm_count``, ``certificate`` (as of `certificate_figures`), ``files``.
+        some entries missing), ``statuses`` (steps by bit), ``resumed`` (steps taken from an interrupted run), ``delay``
+        (L: boxes are from measurements up to L steps later), ``seconds``, ``table`` (what was found in the file and is
+        not plain), ``signals``, ``alarms`` (as in the NetCDF file, the first 10,000), ``alarm_count``, ``certificate``
+        (as of `certificate_figures`), ``files``.
     """
     signals = [
         {
@@ -48,6 +49,7 @@ def run_figures(
         "missing": {"rows": totals.absent, "partly": totals.partly},
         "statuses": totals.statuses,
         "resumed": outcome.resumed,
+        "delay": outcome.boxes.delay,
         "seconds": {
             "design": outcome.design_seconds,
             "compile": outcome.compile_seconds,

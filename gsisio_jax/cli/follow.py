@@ -21,7 +21,7 @@ from .figures import line
 from .logs import Table, TablePart, TableReader
 from .logs.stream import on_grid
 from .problem import Names, Problem, build_problem, importable
-from .run import CHUNK, cut, design
+from .run import CHUNK, cut, design, to_the_end
 from .stopping import exit_code, stoppable
 from .tail import Tail
 from .totals import alarms_of
@@ -73,13 +73,23 @@ class Stepper:
         self.observer = design(problem)
         system = problem.system
         self.kind = record_type(system.n, system.p, system.l)
+        self.delay = getattr(self.observer, "delay", 0)
         self._carry: Any = None
         self._warm_up()
 
     def rows(self, tables: Iterator[Table]) -> Iterator[np.ndarray]:
-        """Records of the rows, as they come."""
-        for table in tables:
-            yield from self._feed(table)
+        """Records of the rows, as they are finished: with a delay of L these are the rows of L steps before."""
+        waiting = np.empty(0, self.kind)
+        for table in to_the_end(tables, self.delay):
+            for rows in self._feed(table):
+                if not self.delay:
+                    yield rows
+                    continue
+                told = np.concatenate([waiting, rows])
+                finished, waiting = rows[max(self.delay - len(waiting), 0) :], told[-self.delay :]
+                for name in ("time", "y"):
+                    finished[name] = told[name][: len(finished)]
+                yield finished
 
     def lines(self, rows: np.ndarray, begin: int) -> Iterator[str]:
         """Rows as lines of JSON; `begin` is the step of the first one."""

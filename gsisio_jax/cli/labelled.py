@@ -66,6 +66,7 @@ class Labelled:
             status=rows["status"],
             margin=rows["margin"],
             alarms=lambda: [],
+            delay=self._boxes.delay,
         )
         dataset = to_dataset(
             estimate,
@@ -88,7 +89,7 @@ class Labelled:
 
 def _hulls(boxes: Boxes) -> np.ndarray:
     """Groups of neighbours, two rows each."""
-    starts = joined(len(boxes), MAXIMUM_POINTS)
+    starts = joined(boxes.steps, MAXIMUM_POINTS)
     found = np.zeros(2 * len(starts), boxes.kind)
     first, second = found[::2], found[1::2]
     for side in (first, second):

@@ -45,6 +45,7 @@ def summarise(
         ("missing rows", f"{totals.absent}{partly}"),
         ("conflicts", _conflicts(totals.alarm_times)),
         ("unbounded", f"{totals.statuses['UNBOUNDED']} steps with a state that is not bounded"),
+        *([("delay", _delay(outcome.boxes.delay))] if outcome.boxes.delay else []),
         *([("resumed", f"after step {outcome.resumed:,}")] if outcome.resumed else []),
         ("design", f"{outcome.design_seconds:.2f} s"),
         ("compile", f"{outcome.compile_seconds:.2f} s"),
@@ -63,6 +64,10 @@ def summarise(
         certificate=certificate_lines(certificate, problem),
         files=[str(path) for path in files],
     )
+
+
+def _delay(steps: int) -> str:
+    return f"boxes of a step are from measurements up to {steps} step{'s' if steps > 1 else ''} later"
 
 
 def alarm_line(record: dict[str, Any]) -> str:

@@ -76,12 +76,13 @@ def run(
     observer = design(problem)
     design_seconds = clock() - began
     system = problem.system
-    boxes = Boxes(record_type(system.n, system.p, system.l), checkpoint and checkpoint.begin)
+    delay = getattr(observer, "delay", 0)
+    boxes = Boxes(record_type(system.n, system.p, system.l), checkpoint and checkpoint.begin, delay=delay)
     runner = _Runner(problem, observer, on_conflict, chunk, boxes, checkpoint)
     progress.stage("compiling")
     began = clock()
     try:
-        rows = chunks(blocks, chunk)
+        rows = chunks(to_the_end(blocks, delay), chunk)
         runner.begin(next(rows), resume)
         progress.stage("estimating", total=total)
         progress.advance(1)
@@ -202,6 +203,17 @@ def chunks(blocks: Iterable[Table], size: int) -> Iterator[Table]:
     rest = joined(waiting)
     if len(rest.time):
         yield rest
+
+
+def to_the_end(blocks: Iterable[Table], delay: int) -> Iterator[Table]:
+    """The rows, and as many missing ones as an observer with a delay needs to finish the last of them."""
+    last: Table | None = None
+    for block in blocks:
+        last = block if len(block.time) else last
+        yield block
+    if delay and last is not None:
+        u = None if last.u is None else np.repeat(last.u[-1:], delay, axis=0)
+        yield Table(np.full(delay, np.nan), np.full((delay, last.y.shape[1]), np.nan), u)
 
 
 def joined(tables: list[Table]) -> Table:

@@ -31,7 +31,7 @@ def _classes() -> dict[str, type]:
     from gsisio_jax.inclusion.atoms import AtomBounds
     from gsisio_jax.inclusion.planes import Abstraction
     from gsisio_jax.interval.box import Interval
-    from gsisio_jax.observer import bank, past, recovery, types, window, window_widths
+    from gsisio_jax.observer import bank, past, recovery, slices, types, window, window_widths
     from gsisio_jax.observer.certificate import Certificate
     from gsisio_jax.observer.delayed import DelayedObserver, Waiting
     from gsisio_jax.observer.prediction_step import PredictionObserver
@@ -41,7 +41,7 @@ def _classes() -> dict[str, type]:
         Abstraction, AffineForm, AtomBounds, Certificate, DelayedObserver, Interval, Noise, PredictionObserver, System,
         Waiting,
         bank.CancellationResidual, bank.LinearBounds, types.Carry, types.ExactInputs, types.InitialContraction,
-        types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, window.Window,
+        types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, slices.Slices, window.Window,
         window_widths.WindowWidths,
     )  # fmt: skip
     return {kind.__name__: kind for kind in found}

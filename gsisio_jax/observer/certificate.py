@@ -20,7 +20,7 @@ class Certificate(eqx.Module):
     is missing, the widths obey ``next_width``, and so settle at or below `steady_width`.
 
     Attributes:
-        certified: the width recursion contracts (`rate` < 1).
+        certified: widths settle: `rate` < 1, or see `slices`.
         rate: spectral radius of ``A + |N_z| R`` (prediction form: ``|G||J1|`` in the place of ``|N_z| R``).
         implicit_rate: spectral radius of ``|N_z| R`` on the region; below 1 the box of x[k] is finite.
         steady_width: (n,) width that the state boxes settle at or below, design noise; ``inf`` if not certified.
@@ -37,6 +37,8 @@ class Certificate(eqx.Module):
             examined. Proved where f and g have affine bounds, else tried without noise from the centre of the region.
         recovery_width: (n,) width of the boxes then (of those at the end of the trial), at the noise of the design.
         window: what rows over several steps make of widths (`WindowWidths`), where f and g are affine; else None.
+        slices: the slopes on parts of the region (`Slices`), where the design was asked to `split` it; else None. Then
+            `next_width` and `steady_width` count them, and widths may settle where `rate` is above 1.
         notes: what a reader should know besides.
         framer: the boxes are certain; False only for a prediction form that is none and was asked for all the same.
 
@@ -64,6 +66,7 @@ class Certificate(eqx.Module):
     recovery_steps: tuple[float, ...] = eqx.field(static=True, default=())
     recovery_width: Any = None
     window: Any = None
+    slices: Any = None
     input_noise_w: Any = None  # (p, n), weight of w in input boxes beside that of `input_state_now`; None: nothing
 
     @property
@@ -78,7 +81,7 @@ class Certificate(eqx.Module):
 
     @property
     def certified(self) -> bool:
-        """The width recursion contracts."""
+        """Widths settle."""
         return self.promised
 
     @property
@@ -95,10 +98,10 @@ class Certificate(eqx.Module):
 
     def without_promise(self, why: str) -> Certificate:
         """No width is promised, for that reason, which becomes a note."""
-        infinite = {name: np.full(np.shape(getattr(self, name)), np.inf) for name in (
+        infinite: dict[str, Any] = {name: np.full(np.shape(getattr(self, name)), np.inf) for name in (
             "growth", "implicit", "input_state_before", "steady_width", "input_width",
         )}  # fmt: skip
-        return replace(self, **infinite, promised=False, notes=(*self.notes, why))
+        return replace(self, **infinite, promised=False, slices=None, notes=(*self.notes, why))
 
     def noise_width(self, noise: Noise) -> Any:
         """What one step adds to the width, b of theory 4.1, (n,) or (T, n)."""
@@ -110,15 +113,23 @@ class Certificate(eqx.Module):
 
     def next_width(self, width: Any, noise: Noise) -> Any:
         """The recursion ``(I - |N_z| R)^{-1} (A width + b)``, (n,) or a stack (..., n)."""
-        inverse = np.linalg.inv(np.eye(len(self.growth)) - np.asarray(self.implicit))
-        return (width @ self.growth.T + self.noise_width(noise)) @ inverse.T
+        grown = width @ self.growth.T if self.slices is None else self.slices.growth(width)
+        return (grown + self.noise_width(noise)) @ self._inverse.T
+
+    @property
+    def _inverse(self) -> np.ndarray:
+        return np.linalg.inv(np.eye(len(self.growth)) - np.asarray(self.implicit))
 
     def widths(self, noise: Noise) -> Any:
         """Steady width (n,) or (..., n) for other noise bounds; all ``inf`` if the recursion does not contract."""
         added = self.noise_width(noise)
         if not self.certified:
             return np.full(np.shape(added), np.inf)
-        settled = added @ np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit).T
+        settled = np.full(np.shape(added), np.inf)
+        if self.slices is None or self.rate < 1:
+            settled = added @ np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit).T
+        if self.slices is not None:
+            return self.slices.settled(np.minimum(settled, self.region.width), self._inverse, added)
         return settled if self.window is None else self.window.settled(settled, noise)
 
     def with_window(self, window: Any, noise: Noise) -> Certificate:
@@ -126,6 +137,15 @@ class Certificate(eqx.Module):
         if not self.promised:
             return self
         found = replace(self, window=window)
+        return replace(found, steady_width=found.widths(noise), input_width=found.input_widths(noise))
+
+    def with_slices(self, slices: Any, noise: Noise) -> Certificate:
+        """The promise that counts slopes slice by slice (`Slices`), at the noise of the design; as it was, where no
+        width is promised either way."""
+        settles = self.promised or np.isfinite(self.region.width).all()
+        if not (settles and np.isfinite(self.growth).all() and self.implicit_rate < 1 - 1e-9):
+            return self
+        found = replace(self, slices=slices, promised=True)
         return replace(found, steady_width=found.widths(noise), input_width=found.input_widths(noise))
 
     def input_widths(self, noise: Noise) -> Any:

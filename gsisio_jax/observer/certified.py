@@ -18,7 +18,7 @@ from gsisio_jax.observer.lost import plainly_wider
 from gsisio_jax.observer.maps import Maps, at_point
 from gsisio_jax.observer.measurement import everything_unless, in_box, inside
 from gsisio_jax.observer.status import Source
-from gsisio_jax.observer.types import Carry
+from gsisio_jax.observer.types import Carry, RoundingConstants
 
 
 class Promised(NamedTuple):
@@ -55,7 +55,7 @@ def certified(
     radius = jnp.where(applies, past.radius, 0)
     promised = Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.value_error))
     gains, constants = observer.gains, observer.rounding_constants
-    around = _around(maps, gains.residual[0], constants.growth, promised, known.right[0])
+    around = _around(maps, gains.residual[0], _reach(constants, before, promised), promised, known.right[0])
     around = plainly_wider(around, _first(left))
     joint, slack = intersect(right[0], around)
     domain = domain.record_margin(jnp.where(applies, slack, jnp.inf), Source.STATE)
@@ -70,15 +70,29 @@ def certified(
     return domain.intersect(everything_unless(applies, box)[None], Source.CERTIFICATE), promised
 
 
-def _around(maps: Maps, weights: Any, slope: Any, promised: Promised, known: Interval) -> Interval:
-    """A linear bound without its terms in x[k]: its value at the centre of the old box, give or take ``slope radius``.
+def _reach(constants: RoundingConstants, before: Interval, promised: Promised) -> tuple[Any, Any]:
+    """How far the certified gain may be below and above its value at the centre of the old box.
 
-    No Jacobian is evaluated online: `slope` is a constant of the design, valid on the region.
+    No Jacobian is evaluated online: slopes are constants of the design, valid on the region.
     """
-    center, radius = at_point(maps.rows(weights), promised.center, promised.center_error, *promised.atoms)
-    radius = radius + matmul(jnp.asarray(slope, radius.dtype), promised.radius)
-    radius = radius + wider(abs(center) + radius, 0)
-    return Interval.unchecked(center - radius + known.lower, center + radius + known.upper)
+    if constants.slices is None:
+        reach = matmul(jnp.asarray(constants.growth, promised.radius.dtype), promised.radius)
+        return reach, reach
+    lower, upper = (jnp.where(promised.applies, side, promised.center) for side in (before.lower, before.upper))
+    return constants.slices.reach(lower, promised.center, upper)
+
+
+def _around(maps: Maps, weights: Any, reach: tuple[Any, Any], promised: Promised, known: Interval) -> Interval:
+    """A linear bound without its terms in x[k]: its value at the centre of the old box, and how far around."""
+    center, error = at_point(maps.rows(weights), promised.center, promised.center_error, *promised.atoms)
+
+    def far(reach: Any) -> Any:
+        radius = error + reach
+        return radius + wider(abs(center) + radius, 0)
+
+    below = far(reach[0])
+    above = below if reach[1] is reach[0] else far(reach[1])
+    return Interval.unchecked(center - below + known.lower, center + above + known.upper)
 
 
 def _first(radius: Any) -> Any:
@@ -99,7 +113,8 @@ def certified_input(
     if promised is None or not observer.system.p:
         return d, domain
     inverses, constants = observer.inverses, observer.rounding_constants
-    around = _around(maps, inverses.residual[0], constants.input_growth, promised, known.inputs[0])
+    reach = matmul(jnp.asarray(constants.input_growth, promised.radius.dtype), promised.radius)
+    around = _around(maps, inverses.residual[0], (reach, reach), promised, known.inputs[0])
     around = plainly_wider(around, _first(left))
     now = plain_image(inverses.state[0], states.wide)
     box = Interval.unchecked(now.lower + around.lower, now.upper + around.upper)

@@ -35,16 +35,6 @@ def rounded(call: str, observer: AnyObserver, rounding: Rounding | None) -> AnyO
     return observer if observer.rounding == rounding else observer.with_rounding(rounding)
 
 
-def refuse_delay(call: str, observer: AnyObserver) -> None:
-    """For calls that hold the boxes of a step against its truth while it runs."""
-    if isinstance(observer, DelayedObserver):
-        raise ValueError(
-            f"{call}: the observer has a delay (of {observer.delay}), so a step does not finish its own box. "
-            "gx.estimate takes it, also over many cases: jax.vmap(lambda noise: gx.estimate(observer, initial, y, "
-            "noise=noise))(noises)"
-        )
-
-
 def check_length(length: Any, rows: int) -> None:
     if np.ndim(length) or not jnp.issubdtype(jnp.result_type(length), jnp.integer):
         raise ValueError(f"estimate: `length` must be one integer per record, got {length!r}; for many use jax.vmap")

@@ -7,6 +7,7 @@ Source: theory 3, 5 and 10.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -29,10 +30,22 @@ from gsisio_jax.observer.residuals import (
     upper_inverse,
     window_residual,
 )
+from gsisio_jax.observer.slice_bounds import slices_of
+from gsisio_jax.observer.slices import Slices
 from gsisio_jax.observer.types import InitialContraction, Observer, RoundingConstants, cast
 
 _UP = 1 + 1e-12  # covers the rounding of a few float64 sums of nonnegative numbers
 _STEPS = ((0.1, 1), (0.3, 3), (0.6, 5), (0.8, 8))  # see `_corrections`
+
+
+def _slices(narrow: Observer, slopes_on: Callable[[Interval], Slopes]) -> Slices | None:
+    """The slices of the certificate for gains of single precision."""
+    certificate = narrow.certificate
+    if certificate.slices is None:
+        return None
+    edges = np.array(certificate.slices.edges)
+    edges[:, 0], edges[:, -1] = certificate.region.lower, certificate.region.upper
+    return slices_of(np.asarray(narrow.gains.residual[0], np.float64), slopes_on, edges, np.float32, parts=2)
 
 
 def contracting_gains(N_z: np.ndarray, Q: np.ndarray, C: Any, everywhere: Slopes) -> list[np.ndarray | None]:
@@ -62,7 +75,7 @@ def single_precision(observer: Observer) -> Observer:
     affine = None if observer.recovery is None else AffineMaps.of(system, narrow.T2, np.float32)
     found = with_rounding_constants(
         narrow, system, region, slopes(system.state_bounds), *first_form(system, narrow.T2, u_region, np.float32),
-        affine, np.float32,
+        affine, np.float32, _slices(narrow, slopes),
     )  # fmt: skip
     return jax.tree.map(lambda x: jnp.asarray(x, np.float32), found)
 
@@ -76,6 +89,7 @@ def with_rounding_constants(
     slack: np.ndarray,
     affine: AffineMaps | None,
     dtype: Any,
+    slices: Slices | None = None,
 ) -> Observer:
     """The observer with the constants that rounding asks for, its gains being what they are in `dtype`.
 
@@ -86,6 +100,7 @@ def with_rounding_constants(
         form, slack: from `first_form`.
         affine: bounds that rows of recovery stand on; needed where there are any.
         dtype: float64 or float32.
+        slices: slopes of the certified gain on parts of the region.
     """
     wide: Any = jax.tree.map(lambda x: np.asarray(x, np.float64), observer)
     system = plant
@@ -135,6 +150,7 @@ def with_rounding_constants(
         input_growth=_cast(_slope(-wide.inverses.residual[0], region, n), dtype),
         feedthrough=_cast(H_slack, dtype),
         direct=tuple(inverses),
+        slices=slices,
     )
     window = wide.window
     if window is not None:

@@ -64,6 +64,7 @@ class RoundingConstants(eqx.Module):
         growth, input_growth: slope of the certified gain and of the first left inverse around the middle of a box in
             the region, (n, n) and (p, n), rounded up.
         feedthrough: (l, p), how far the H of the promise may be from the one that is written.
+        slices: the slopes of the certified gain on parts of the region (`Slices`) in that type, or None.
         direct: indices of left inverses of [G; H] itself.
 
     Source: theory 10.
@@ -79,6 +80,7 @@ class RoundingConstants(eqx.Module):
     input_growth: Any
     feedthrough: Any
     direct: tuple[int, ...] = eqx.field(static=True)
+    slices: Any = None
 
 
 class ExactInputs(eqx.Module):

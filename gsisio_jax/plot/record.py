@@ -70,7 +70,8 @@ def _read_dataset(dataset: Any, call: str) -> Record:
         np.isnan(np.stack(list(outputs.values()))).all(axis=0) if outputs else _missing(variables["status"].values)
     )
     alarms = np.array([alarm["time"] for alarm in json.loads(dataset.attrs.get("alarms", "[]"))])
-    return Record(dataset.attrs.get("title", ""), *time_of(dataset), series, missing, alarms)
+    title = ", ".join(part for part in (dataset.attrs.get("title", ""), told_delay(dataset)) if part)
+    return Record(title, *time_of(dataset), series, missing, alarms)
 
 
 def _measurements(variables: Any) -> dict[str, np.ndarray]:
@@ -111,7 +112,8 @@ def _read_case(dataset: Any, call: str) -> Record:
             series[low.signal] = Series(low.signal, low.unit, lower, upper, None, kind)
     # Rows of an unfinished study are not a number.
     status = np.nan_to_num(dataset["status"].values).astype(int) if "status" in dataset else np.zeros(len(time), int)
-    title = ", ".join(part for part in (dataset.attrs.get("title", ""), fixed(dataset)) if part)
+    said = dataset.attrs.get("title", ""), fixed(dataset), told_delay(dataset)
+    title = ", ".join(part for part in said if part)
     return Record(title, time, time_label, series, _missing(status), time[(status & int(Status.CONFLICT)) != 0])
 
 
@@ -135,7 +137,7 @@ def _read_estimate(est: Any, call: str) -> Record:
 
 
 def told_delay(est: Any) -> str:
-    """A title that says from when boxes with a delay are; none for others."""
+    """A title that says from when boxes with a delay are; none for others. Takes an estimate or a dataset of one."""
     delay = getattr(est, "delay", 0)
     return f"boxes from measurements up to {delay} step{'s' if delay > 1 else ''} later" if delay else ""
 

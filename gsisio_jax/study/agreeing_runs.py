@@ -63,16 +63,18 @@ class AgreeingRuns:
         self.n = system.n
         self.maps = Maps(system, rows, 2 * system.n * len(SHARES))
 
-    def hull(self, stretch: Stretch, near: Sides) -> Sides:
-        """The hull (n,) of the last states of the runs that are found; NaN where none is.
+    def hull(self, stretch: Stretch, near: Sides, row: int) -> Sides:
+        """The hull (n,) of the states in a row of the runs that are found; NaN where none is.
 
         Args:
             stretch: the record; its state bounds are those of the plant.
             near: boxes (s, n) to look for runs in.
+            row: index of the row.
         """
-        # The boxes guide the programs; a run that leaves them counts, too. The last state is left free: a program that
-        # is extreme at a side of its box would leave open which way leads there.
-        guide = Sides(*(np.concatenate([a[:-1], b[-1:]]) for a, b in zip(near, stretch.state, strict=True)))
+        # The boxes guide the programs; a run that leaves them counts, too. The state of that row is left free: a
+        # program that is extreme at a side of its box would leave open which way leads there.
+        here = np.arange(stretch.length)[:, None] == row
+        guide = Sides(*(np.where(here, b, a) for a, b in zip(near, stretch.state, strict=True)))
         inside = replace(stretch, state=guide)
         first = self._first(inside, stretch)
         n = self.n
@@ -82,13 +84,13 @@ class AgreeingRuns:
         sides = range(2 * n)
         signs, states = np.repeat([1, -1], n), np.tile(np.arange(n), 2)
         best = np.tile(x0, (2 * n, 1, 1))
-        reached = signs * x0[-1, states]
+        reached = signs * x0[row, states]
         reach, idle = np.full((2 * n, n), np.inf), np.zeros(2 * n, int)  # of a step, per state; rounds
         for _ in range(ROUNDS):
             proposed = best.copy()
             inputs = np.tile(d0, (2 * n, 1, 1))
             for j in (j for j in sides if idle[j] < PATIENCE):
-                found = self._program(inside, best[j], reach[j]).extreme(states[j], signs[j])
+                found = self._program(inside, best[j], reach[j]).extreme(states[j], signs[j], row)
                 if found.x is not None and found.d is not None:
                     proposed[j], inputs[j] = found.x, found.d
             share = SHARES[:, None, None, None]
@@ -97,7 +99,7 @@ class AgreeingRuns:
             x, agrees = x.reshape(len(SHARES), *best.shape), agrees.reshape(len(SHARES), -1)
             width = -(reached[:n] + reached[n:])
             for j in (j for j in sides if idle[j] < PATIENCE):
-                ends = np.where(agrees[:, j], signs[j] * x[:, j, -1, states[j]], np.inf)
+                ends = np.where(agrees[:, j], signs[j] * x[:, j, row, states[j]], np.inf)
                 i = ends.argmin()
                 gain = reached[j] - ends[i]
                 idle[j] = 0 if gain > ENOUGH * width[states[j]] else idle[j] + 1

@@ -12,6 +12,7 @@ import numpy as np
 from gsisio_jax.errors import ContainmentLost
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.types import StepOutput
+from gsisio_jax.study.later import delay_of
 from gsisio_jax.study.reduction_base import Context, Kept, Variable
 from gsisio_jax.study.truth import Coverage
 
@@ -95,10 +96,11 @@ def check(job: Any, cases: np.ndarray, results: dict[str, np.ndarray]) -> None:
         step, (place, number) = int(at[row]), _place(job, cases[row])
         data = np.asarray(job.arguments["key"]).tolist()
         impl = "" if job.rows.impl == str(jax.random.key_impl(jax.random.key(0))) else f", impl={job.rows.impl!r}"
+        steps = step + 1 + delay_of(job.observer)
         raise ContainmentLost(
             f"{job.call}: {what(results, row)} in run {number}{place} at step {step}. To see it, call {job.call} with "
             f"the same arguments, but key=jax.random.wrap_key_data(jax.numpy.array({data}, dtype='uint32'){impl}), "
-            f'runs=[{number}], steps={step + 1}, reduce=None, on_miss="record"; {int(bad.sum())} of {len(cases)} runs '
+            f'runs=[{number}], steps={steps}, reduce=None, on_miss="record"; {int(bad.sum())} of {len(cases)} runs '
             "of this tile are concerned"
         )
 

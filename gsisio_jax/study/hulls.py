@@ -36,11 +36,11 @@ def tightness(
 
     The hull of x[k] is the smallest box of all states that some run of the plant has at k, with noise, initial state,
     known state and input bounds as stated, whose measurements are y[0..k]; no observer can be narrower. (For observers
-    with a delay of L: y[0..k+L], and f and g must be affine.) Where f and g
-    are affine in x (for the known inputs at hand, on the state bounds) two linear programs a state and step give it up
-    to the tolerance of HiGHS (1e-10). Otherwise runs as far apart as possible are looked for, and every one is played
-    through the plant and checked against the record (to 1e-12 of the size of a measurement): their hull is a *lower
-    bound* of the hull, and the ratio an *upper bound* of what is left to gain.
+    with a delay of L: y[0..k+L].) Where f and g are affine in x (for the known inputs at hand, on the state bounds) two
+    linear programs a state and step give it up to the tolerance of HiGHS (1e-10). Otherwise runs as far apart as
+    possible are looked for, and every one is played through the plant and checked against the record (to 1e-12 of the
+    size of a measurement): their hull is a *lower bound* of the hull, and the ratio an *upper bound* of what is left to
+    gain.
 
     Args:
         observer: from `design_observer`; in the prediction form x[k] is bounded from y[0..k-1], and so is the hull.
@@ -57,8 +57,7 @@ def tightness(
         `Tightness`. Rows in which nothing agrees with the record (a conflict) are NaN.
 
     Raises:
-        ValueError: as `estimate`; a step is not in the record, the horizon is below 1, the system is periodic, or the
-            observer has a delay and f or g is not affine.
+        ValueError: as `estimate`; a step is not in the record, the horizon is below 1, or the system is periodic.
         RuntimeError: HiGHS fails on a program.
 
     >>> import gsisio_jax as gx
@@ -88,10 +87,6 @@ def tightness(
     boxes = _sides(estimate(observer, initial, y, u, noise).state)
     record = _record(system, y, u_ready, observer.noise if noise is None else noise)
     affine = affine_plant(system, record.u)
-    if affine is None and isinstance(observer, DelayedObserver):
-        raise ValueError(
-            f"{call}: f or g is not affine, and runs of such plants are looked for with observers without a delay only"
-        )
     found = _hulls(observer, record, affine, boxes, _sides(initial), chosen, horizon)
     return Tightness(chosen, *boxes.rows(chosen), *found, affine is not None, horizon)
 
@@ -162,8 +157,8 @@ def _hulls(
     from gsisio_jax.study.record_program import exact_hull
 
     delay = observer.delay if isinstance(observer, DelayedObserver) else 0
-    longest = int(chosen[-1]) + 1 if horizon is None else min(horizon, int(chosen[-1])) + 1
-    runs = None if affine is not None else AgreeingRuns(observer.system, longest)
+    longest = int(chosen[-1]) if horizon is None else min(horizon, int(chosen[-1]))
+    runs = None if affine is not None else AgreeingRuns(observer.system, longest + delay + 1)
     found = []
     for k in chosen:
         first = 0 if horizon is None else max(k - horizon, 0)
@@ -173,7 +168,7 @@ def _hulls(
         if affine is not None:
             found.append(exact_hull(stretch, affine.rows(slice(first, last + 1)), k - first))
         elif runs is not None:
-            found.append(runs.hull(stretch, _met(stretch.state, boxes.rows(slice(first, k + 1)))))
+            found.append(runs.hull(stretch, _met(stretch.state, boxes.rows(slice(first, last + 1))), k - first))
     return Sides(*(np.array(side) for side in zip(*found, strict=True)))
 
 

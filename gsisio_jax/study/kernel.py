@@ -16,9 +16,11 @@ import numpy as np
 from gsisio_jax import scalar
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.checks import AnyObserver
+from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.plant.periodic import nearest
 from gsisio_jax.scalar.options import loop_bytes
+from gsisio_jax.study import later
 from gsisio_jax.study.axes import bare
 from gsisio_jax.study.reduction_base import Context, Kept, Reduction
 from gsisio_jax.study.row_source import Rows
@@ -83,15 +85,24 @@ def _run(
 def _case(
     observer: AnyObserver, case: Any, source: Rows, reductions: tuple[Reduction, ...], hold: bool
 ) -> dict[str, Any]:
-    length, steady = case.get("length"), case["steady"]
-    carry, carried, states, _ = _start(observer, case, source, reductions, hold)
+    length, steady, delay = case.get("length"), case["steady"], later.delay_of(observer)
+    # The last steps lack measurements where the observer has a delay: their boxes are kept, but do not count.
+    count = (source.steps(case) if length is None else length) - delay
+    carry, carried, states, _, truth = _start(observer, case, source, reductions, hold)
 
     def body(state: Any, step: Any) -> tuple[Any, Any]:
-        carry, carried, states = state
+        carry, carried, states, truth = state
         k, given = step
-        row, carried = source.following(observer, case, carried, k, given)
+        if delay:
+            row, carried = later.following(source, observer, case, carried, k, given)
+            (x, d), truth = later.exchange(truth, row)
+            k = k - delay  # the step that this row finishes
+        else:
+            row, carried = source.following(observer, case, carried, k, given)
+            x, d = row.x, row.d
         carry, out = scan.advance(observer, carry, row.y, row.u, row.noise, hold)
-        context = Context(steady, nearest(observer, row.x, out.state), row.d)
+        context = Context(steady, nearest(observer, x, out.state), d)
+        counts = None if length is None and not delay else (k >= 0) & (k < count)
         after, kept = [], []
         for reduction, before in zip(reductions, states, strict=True):
             if isinstance(reduction, Kept):
@@ -99,34 +110,39 @@ def _case(
                 kept.append(reduction.row(out, k, context))
                 continue
             new = reduction.update(before, out, k, context)
-            if length is not None:
-                # Rows behind the end of a ragged record do not count.
-                new = jax.tree.map(lambda a, b: jnp.where(k < length, a, b), new, before)
+            if delay:
+                first = jax.tree.map(jnp.asarray, reduction.init(out, context))
+                new = jax.tree.map(lambda a, b: jnp.where(k == 0, a, b), first, new)
+            if counts is not None:
+                # Steps behind the end of the record do not count, nor do those before it.
+                new = jax.tree.map(lambda a, b: jnp.where(counts, a, b), new, before)
             after.append(new)
             kept.append(None)
-        return (carry, carried, after), kept
+        return (carry, carried, after, truth), kept
 
     running = [None if isinstance(r, Kept) else state for r, state in zip(reductions, states, strict=True)]
-    steps = jnp.arange(1, source.steps(case), dtype=jnp.int32), source.given(case)
-    (_, carried, running), kept = scalar.scan(body, (carry, carried, running), steps)
-    count = source.steps(case) if length is None else length
+    given = later.longer(source, case, delay) if delay else source.given(case)
+    steps = jnp.arange(1, source.steps(case) + delay, dtype=jnp.int32), given
+    (_, carried, running, _), kept = scalar.scan(body, (carry, carried, running, truth), steps)
     results: dict[str, Any] = {}
     for reduction, start, state, rest in zip(reductions, states, running, kept, strict=True):
         if isinstance(reduction, Kept):
-            state = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, rest)
+            state = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b])[delay:], start, rest)
         results |= reduction.finish(state, count, Context(steady))
     return results | source.results(carried)
 
 
 def _start(
     observer: AnyObserver, case: Any, source: Rows, reductions: tuple[Reduction, ...], hold: bool
-) -> tuple[Any, Any, list[Any], Any]:
-    """Step 0: the carry of the observer, that of the source, the states of the reductions, and the boxes."""
+) -> tuple[Any, Any, list[Any], Any, Any]:
+    """Step 0: the carry of the observer, that of the source, the states of the reductions, the boxes, and the truth
+    that waits for its boxes where the observer has a delay (states and boxes say nothing yet then)."""
     row, carried = source.first(observer, case)
     carry, out = scan.begin(observer, case["initial"], row.y, row.u, row.noise, hold)
     context, zero = Context(case["steady"], nearest(observer, row.x, out.state), row.d), jnp.int32(0)
     states = [r.row(out, zero, context) if isinstance(r, Kept) else r.init(out, context) for r in reductions]
-    return carry, carried, jax.tree.map(jnp.asarray, states), out
+    delay = later.delay_of(observer)
+    return carry, carried, jax.tree.map(jnp.asarray, states), out, later.waiting(row, delay) if delay else None
 
 
 class Outline(NamedTuple):
@@ -170,7 +186,7 @@ def outline(
     def small(observer: AnyObserver, varying: Any, shared: Any) -> Any:
         nonlocal turns
         case = eqx.combine(jax.tree.map(lambda a: a[0], varying), shared)
-        carry, carried, states, out = _start(observer, case, source, reductions, hold)
+        carry, carried, states, out, truth = _start(observer, case, source, reductions, hold)
         turns = source.steps(case)
         results: dict[str, Any] = {}
         kept: list[Any] = []
@@ -180,7 +196,7 @@ def outline(
                 kept.append(state)
             count = turns if case.get("length") is None else case["length"]
             results |= reduction.finish(state, count, Context(case["steady"]))
-        return results | source.results(carried), (carry, carried, out, states), kept
+        return results | source.results(carried), (carry, carried, out, states, truth), kept
 
     traced, found = jax.make_jaxpr(small, return_shape=True)(observer, dict(varying), dict(shared))
     results, moving, kept = found
@@ -248,7 +264,10 @@ def fingerprint(
     system = observer.system
     maps = jax.make_jaxpr(system.maps)(np.zeros(system.n), np.zeros(system.m))
     names = [repr(r) if is_dataclass(r) else f"{type(r).__qualname__} {r.name}" for r in reductions]
-    static = [getattr(observer, name, None) for name in ("bounds", "sweeps", "output_rows", "framer", "rounding")]
+    inner = observer.inner if isinstance(observer, DelayedObserver) else observer
+    static = [getattr(inner, name, None) for name in ("bounds", "sweeps", "output_rows", "framer", "rounding")]
+    if isinstance(observer, DelayedObserver):
+        static.append((observer.delay, observer.lift.more))
     if system.periodic or system.periodic_states:
         static.append((system.periodic, system.periodic_states))
     text, constants = source.identity(observer)

@@ -24,6 +24,7 @@ from gsisio_jax.study.axes import RUN, Axis, Layout, bare
 from gsisio_jax.study.containment import Containment, TrueRun
 from gsisio_jax.study.job import Job
 from gsisio_jax.study.labels import Labels
+from gsisio_jax.study.later import check_longer
 from gsisio_jax.study.plant import Simulated
 from gsisio_jax.study.reductions import resolve
 from gsisio_jax.study.run import run
@@ -77,7 +78,7 @@ def monte_carlo(
     runs are the beginnings of longer ones, and cases that differ in noise bounds or boxes share their random numbers.
 
     Args:
-        observer: from `design_observer`.
+        observer: from `design_observer`; with a delay as in `sweep`.
         key: a key of `jax.random`, or an integer seed.
         runs: how many; or the numbers of the runs to do, for example ``[17]``.
         steps: measurements T of each run.
@@ -108,15 +109,13 @@ def monte_carlo(
     Raises:
         ContainmentLost: a box missed the truth, or a run broke its own bounds. The message says which run and step, and
             how to do that run again. Finished tiles of a store are kept.
-        ValueError: shapes or axes do not agree, a number is not legal, a reduction is unknown, or the observer has a
-            delay.
+        ValueError: shapes or axes do not agree, a number is not legal, or a reduction is unknown.
         MissingExtra: xarray is not installed.
 
     Source: theory 1, 11 and 13.
     """
     need("xarray", extra="study", purpose="a Monte Carlo study")
     observer = checks.rounded(CALL, observer, rounding)
-    checks.refuse_delay(CALL, observer)
     hold = checks.check_on_conflict(CALL, on_conflict)
     if on_miss not in ("raise", "record"):
         raise ValueError(f'{CALL}: `on_miss` must be "raise" or "record", got {on_miss!r}')
@@ -125,6 +124,7 @@ def monte_carlo(
     numbers = _numbers(runs)
     key = read_key(CALL, key)
     _check_steps(steps)
+    check_longer(CALL, observer, steps, None)
     if not callable(draw) and draw not in ("uniform", "vertices"):
         raise ValueError(f'{CALL}: `draw` must be "uniform", "vertices" or a function, got {draw!r}')
 

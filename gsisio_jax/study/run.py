@@ -17,6 +17,7 @@ from gsisio_jax.study.certified_widths import beside, promised
 from gsisio_jax.study.crew import Crew
 from gsisio_jax.study.job import Job, Results, Running
 from gsisio_jax.study.labels import Labels, coordinates_of, variables_of
+from gsisio_jax.study.later import delay_of
 
 
 def run(
@@ -64,6 +65,7 @@ def run(
         "certificate": str(observer.certificate),
         "guaranteed": observer.guaranteed,
         "steps": labels.steps,
+        **({"delay": delay} if (delay := delay_of(observer)) else {}),
         "tile": job.size,
         "library": f"gsisio_jax {__version__}, jax {jax.__version__}",
     }

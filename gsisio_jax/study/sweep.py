@@ -16,6 +16,7 @@ from gsisio_jax.study.arguments import prepare
 from gsisio_jax.study.axes import Axis, Layout, bare
 from gsisio_jax.study.job import Job
 from gsisio_jax.study.labels import Labels
+from gsisio_jax.study.later import check_longer
 from gsisio_jax.study.reductions import resolve
 from gsisio_jax.study.row_source import Recorded
 from gsisio_jax.study.run import run
@@ -56,7 +57,8 @@ def sweep(
     bit for bit only between sweeps, on a CPU with tiles of any size that is not below a chunk, however many threads.
 
     Args:
-        observer: from `design_observer`.
+        observer: from `design_observer`. With a delay of L the last L steps lack measurements: ``reduce=None`` keeps
+            their boxes, and reductions leave them out.
         initial: boxes of x[0], (n,) or (S, n).
         y: measurements (T, l) or (S, T, l), units of the outputs; NaN marks a missing entry.
         noise: bounds at run time, (n,) and (l,), or with a batch axis (S, n), (S, l); None takes those of the design.
@@ -88,15 +90,13 @@ def sweep(
         same for the noise of the design; infinite without a certificate.
 
     Raises:
-        ValueError: shapes or axes do not agree, a number is not legal, a reduction is unknown, or the observer has a
-            delay.
+        ValueError: shapes or axes do not agree, a number is not legal, or a reduction is unknown.
         MissingExtra: xarray is not installed.
 
     Source: theory 6 and 11.
     """
     need("xarray", extra="study", purpose="a sweep")
     observer = checks.rounded(CALL, observer, rounding)
-    checks.refuse_delay(CALL, observer)
     reductions = resolve(CALL, reduce, truth is not None)
     hold = checks.check_on_conflict(CALL, on_conflict)
     given = {
@@ -107,5 +107,6 @@ def sweep(
     Layout.build(CALL, arguments)  # axes that do not agree are refused before anything is computed from them
     steps = bare(arguments["y"]).shape[-2]
     labels = Labels.of(CALL, observer.system, state_names, input_names, state_units, input_units, time, steps)
+    check_longer(CALL, observer, steps, arguments["length"])
     job = Job.plan(CALL, observer, arguments, dtype, None, Recorded(), reductions, hold, batch)
     return run(job, observer, labels, title, store, resume, progress, client, mesh)

@@ -195,6 +195,12 @@ def test_a_nonlinear_spring():
         inside = (np.asarray(est.status) & Status.OUTSIDE_REGION) == 0
         assert inside[5:-1].any()
         assert (np.asarray(est.state.width)[1:-1][inside[1:-1]] <= widths * (1 + 1e-6)).all()
+    # Runs that agree with y[0..9] reach both sides of the position, and nearly those of the speed.
+    found = gx.tightness(observer, start, run.y, u, steps=[8])
+    assert not found.exact
+    assert (found.ratio >= 1 - 1e-9).all()
+    np.testing.assert_allclose(found.hull_width[0, 0], 0.02, rtol=1e-6)
+    assert found.ratio[0, 1] < 1.6
 
 
 def test_batches_and_gradients(record):
