@@ -26,7 +26,7 @@ from gsisio_jax.plant.system import Noise
 
 
 class Recovery(eqx.Module):
-    """R rows for single states from measurements, known inputs and noise of the last N steps; lag t is step k-1-t.
+    """R rows for single states from measurements, known inputs and noise of N steps and of now; lag t is step k-1-t.
 
         x_i in sum over t of {multipliers [B u + w; D u + v - y]}[k-1-t] + output (y - D u - v)[k] + constant
                + sum over t of known (bounded inputs)[k-1-t]  +-  slack size
@@ -42,7 +42,7 @@ class Recovery(eqx.Module):
         scales: (n + l,), one over the units in which equations of the plant and outputs count for `size`; 0 for those
             that no row uses.
         floor: (), least size: constants and bounded inputs.
-        width: (n,), of boxes from these rows alone, at the noise of the design.
+        width: (R,), of boxes from these rows alone, at the noise of the design.
         targets: the state i of every row.
     """
 
@@ -65,9 +65,21 @@ class Recovery(eqx.Module):
 
 @jax.named_scope("recovery")
 def contract(observer: Any, domain: Domain, carry: Any, y: Any, u: Any, noise: Noise) -> Domain:
-    """Contract the box of x[k] with every row; they hold as long as all measurements of the N steps are believed."""
-    rows, system = observer.recovery, observer.system
-    steps = (past.last(carry, None), *carry.older[: rows.length - 1])
+    """Contract the box of x[k] with all rows; they hold as long as all measurements of their steps are believed."""
+    for rows in observer.recovery:
+        domain = domain.intersect(_boxes(observer, rows, carry, y, u, noise), Source.STATE)
+    return domain
+
+
+def covers_all(observer: Any) -> bool:
+    """Is there a row for every state?"""
+    return len({i for rows in observer.recovery or () for i in rows.targets}) == observer.system.n
+
+
+def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noise) -> Interval:
+    """What rows of one length say of x[k], (1, n)."""
+    system = observer.system
+    steps = (past.last(carry, None), *carry.older)[: rows.length]
     terms = rows.length * rows.multipliers.shape[-1] + system.l + rows.known.shape[-1] * rows.length + 4
     now = output_box(system, y, u, noise.v)
     total = plain_image(rows.output, widened_for_sums(now, terms))
@@ -85,4 +97,4 @@ def contract(observer: Any, domain: Domain, carry: Any, y: Any, u: Any, noise: N
         total = plainly_wider(total, rounding.generous(scale(rows.slack, size)))
     # A missing measurement makes the size infinite, and then nothing is known.
     holds = holds & (size < jnp.inf)
-    return domain.intersect(by_state(everything_unless(holds, total), rows.targets, system.n), Source.STATE)
+    return by_state(everything_unless(holds, total), rows.targets, system.n)

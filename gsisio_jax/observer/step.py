@@ -124,7 +124,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         nothing = Domain.of(typed(bounds, y.dtype), size)
         alone = _output(nothing, maps.states(bounds), first.on(bounds), known.z)
         domain = nothing.intersect(everything_unless(carry.starts, before)[None], Source.INITIAL)
-        if observer.recovery is not None:
+        if observer.recovery:
             domain = recovery.contract(observer, domain, carry, y, u, noise)
         domain = _output(domain, maps.states(domain.box), first.on(domain.box), known.z)
         lost = Lost(observer, d_fixed)
@@ -209,7 +209,7 @@ def _finish(
     # Even the fallback may contradict itself (y[k] against the state bounds): then only the state bounds are left. So
     # they are where it is no whole box and later rows give one: if y[k] is what was wrong, none of them would tell.
     nothing = fallback.conflict
-    if observer.recovery is not None and not hold:
+    if observer.recovery and recovery.covers_all(observer) and not hold:
         nothing = nothing | ~_whole(fallback.box)
     restart = choose(nothing, typed(system.state_bounds, dtype), fallback.box)
     state = _limited(choose(conflict, restart, domain.box))

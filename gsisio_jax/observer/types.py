@@ -124,7 +124,7 @@ class Observer(eqx.Module):
         sweeps: how often the box is contracted in a step.
         rounding_constants: what the gains leave by rounding.
         window: rows over several steps (`observer.window.Window`), or None.
-        recovery: rows that need no box to begin with (`observer.recovery.Recovery`), or None.
+        recovery: rows that need no box to begin with (`observer.recovery.Recovery`), those of one length together.
         corrections: Newton steps to the point that the certified bound is around (theory 5.6).
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
     """
@@ -151,7 +151,7 @@ class Observer(eqx.Module):
     bounds: tuple[str, ...] = eqx.field(static=True)
     sweeps: int = eqx.field(static=True)
     window: Any = None
-    recovery: Any = None
+    recovery: Any = ()
     corrections: int = eqx.field(static=True, default=0)
     rounding: Rounding = eqx.field(static=True, default="outward")
 
