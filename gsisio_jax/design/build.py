@@ -29,6 +29,7 @@ from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
 from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.region import find_region
+from gsisio_jax.design.tolerant import Guessed, check_tolerate, tolerant
 from gsisio_jax.design.undefined import undefined_in
 from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
@@ -39,6 +40,7 @@ from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.recovery_constants import AffineMaps
 from gsisio_jax.observer.rounding_constants import with_rounding_constants
+from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.observer.window_widths import WindowWidths
 from gsisio_jax.plant.system import Noise, System
@@ -59,7 +61,27 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = 1,
     delay: Literal[0] = 0,
+    tolerate: Literal[0] = 0,
 ) -> Observer: ...
+
+
+@overload
+def design_observer(
+    system: System,
+    noise: Noise,
+    region: Interval | Literal["auto"],
+    form: Literal["current"] = "current",
+    *,
+    gains: int = 1,
+    u_region: Interval | None = None,
+    missing: bool = True,
+    sweeps: int = 3,
+    bounds: Sequence[str] | None = None,
+    certify: bool = True,
+    window: int | Literal["auto"] = 1,
+    delay: Literal[0] = 0,
+    tolerate: int,
+) -> Observer | TolerantObserver: ...
 
 
 @overload
@@ -111,7 +133,8 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = 1,
     delay: int | Literal["auto"] = 0,
-) -> Observer | PredictionObserver | DelayedObserver:
+    tolerate: int = 0,
+) -> Observer | PredictionObserver | DelayedObserver | TolerantObserver:
     """Design the gains of an interval observer offline, and certify the width of its boxes.
 
     Args:
@@ -147,6 +170,9 @@ def design_observer(
             positions are measured), or to smooth. Outputs, but for those of step k, must be affine in the state, and
             so must be for L >= 2 the parts of f that they see. "auto" takes the smallest L up to n that shows every
             unknown input. The result is a `DelayedObserver`; online its boxes come L steps late.
+        tolerate: q: boxes are certain even if up to q outputs of any one step are wrong, whichever these are. Outputs
+            are voted out: `Estimate.kept` says which agree. The result is a `TolerantObserver`; a step is as many
+            steps as there are choices of q wrong outputs in this and in the last measurement.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
@@ -162,6 +188,7 @@ def design_observer(
 
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
+    votes = check_tolerate(tolerate, system, form, missing, window, delay)
     given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
     if check_delay(delay, system, form):
 
@@ -190,6 +217,9 @@ def design_observer(
     bank = [main, *profile_bank(problem, main, box, gains - 1)]
     if missing or system.periodic:  # the multiple of a periodic output is chosen without that output
         bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
+    guessed = Guessed(problem, main, box, feedthrough, tolerate) if votes else None
+    if guessed is not None:
+        bank.extend(guessed.gains())
     bank = distinct([*bank, *gains_without_state_bounds(problem, main, box)])
     steady = problem.steady_width(bank[0])
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
@@ -208,10 +238,13 @@ def design_observer(
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
     maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
     if maps is not None:
-        observer = replace(observer, recovery=dead_beat_rows(problem, maps, width))
+        rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
+        observer = replace(observer, recovery=rows_alone)
     observer = with_rounding_constants(observer, system, first.slopes, everywhere, outputs, slack, maps, np.float64)
     if certify:
         check_initial_contraction(problem, bank[0], observer, outputs)
+    if votes:
+        return tolerant(observer, tolerate)
     if not missing:
         return observer
     return replace(observer, certificate=with_recovery(observer, width, u_region))

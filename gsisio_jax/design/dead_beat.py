@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +19,12 @@ _LARGEST = 60  # states beyond which these programs take minutes
 _NOTHING = 1e-9  # singular values below this share count as 0
 
 
-def dead_beat_rows(problem: GainProblem, maps: AffineMaps, width: np.ndarray) -> tuple[Recovery, ...]:
+def dead_beat_rows(
+    problem: GainProblem,
+    maps: AffineMaps,
+    width: np.ndarray,
+    lost: tuple[Collection[int], Collection[int]] | None = None,
+) -> tuple[Recovery, ...]:
     """One row for every state that measurements determine, over its own shortest window, with no weight on any box of
     an earlier step, of least noise.
 
@@ -26,16 +32,21 @@ def dead_beat_rows(problem: GainProblem, maps: AffineMaps, width: np.ndarray) ->
         problem: of the design.
         maps: affine bounds of f, g and T2 g on the state bounds; what these leave open counts as noise.
         width: (n,) typical widths of boxes, as units.
+        lost: outputs of y[k-1] and of y[k] to do without; then rows look back one step at most.
 
     Returns:
         The rows, those of one length together, without what rounding leaves of them (see `recovery_constants`); none
-        where y[k] alone determines all states.
+        where all of y[k] alone determines all states.
     """
     n, l, q = problem.n, problem.l, problem.q
-    if n > _LARGEST or np.linalg.matrix_rank(maps.slope[n + l :]) == n:
+    if n > _LARGEST or (lost is None and np.linalg.matrix_rank(maps.slope[n + l :]) == n):
         return ()
     F, E, Z = np.split(maps.slope, [n, n + l])
-    affine = replace(problem, F=F, E=E, C=np.vstack([Z, problem.C[q:]]))
+    before, now = (np.isin(np.arange(l), list(outputs)) for outputs in lost or ((), ()))
+    # An output without slopes and inputs is none.
+    E, H = np.where(before[:, None], 0, E), np.where(before[:, None], 0, problem.H)
+    Z = np.where((problem.T2[:, now] != 0).any(1)[:, None], 0, Z)
+    affine = replace(problem, F=F, E=E, H=H, C=np.vstack([Z, problem.C[q:]]))
     scaled = affine.scaled(width)
     # Widths of what is known of an equation, over its units.
     y = np.where(problem.dv > 0, problem.dv, 1.0)
@@ -43,7 +54,7 @@ def dead_beat_rows(problem: GainProblem, maps: AffineMaps, width: np.ndarray) ->
     of_f, of_g = of_f + scaled.dw / 2, of_g + scaled.dv / 2
     determined = steps_until_determined(scaled)
     found, waiting = [], [i for i in range(n) if np.isfinite(determined[i])]
-    for steps in range(n + 1):
+    for steps in range(n + 1 if lost is None else 2):
         if not waiting:
             break
         program = _without_boxes(scaled, steps)
@@ -58,7 +69,9 @@ def dead_beat_rows(problem: GainProblem, maps: AffineMaps, width: np.ndarray) ->
                 radius[state] = row[1]
         if radius:
             waiting = [i for i in waiting if i not in radius]
-            found.append(_as_recovery(affine, steps, rows, radius, width, y))
+            scales = np.tile(1 / np.concatenate([width, y]), (steps + 1, 1))
+            scales[:steps, n:][:, before], scales[-1, n:][now] = 0, 0
+            found.append(_as_recovery(affine, steps, rows, radius, width, scales))
     return tuple(found)
 
 
@@ -70,16 +83,16 @@ def steps_until_determined(problem: GainProblem) -> np.ndarray:
     where it stays what it is, it stays so for good.
     """
     n, Z, G, H = problem.n, problem.C[: problem.q], problem.G[:, problem.free], problem.H[:, problem.free]
-    unseen, steps = _kernel(Z), np.full(n, np.inf)
+    unseen, before, steps = _kernel(Z), np.eye(n), np.full(n, np.inf)
     for N in range(n + 1):
         steps = np.where(np.isinf(steps) & (np.abs(unseen).max(1, initial=0.0) < _NOTHING), N, steps)
         # (a, d) that y[k-1] does not show and that lead to a state that y[k] does not show, whatever d[k] is.
-        ahead = np.hstack([problem.F @ unseen, G])
-        quiet = _kernel(np.vstack([np.hstack([problem.E @ unseen, H]), Z @ ahead]))
+        ahead = np.hstack([problem.F @ before, G])
+        quiet = _kernel(np.vstack([np.hstack([problem.E @ before, H]), Z @ ahead]))
         after = _basis(ahead @ quiet)
         if after.shape[1] == unseen.shape[1]:
             break
-        unseen = after
+        unseen = before = after
     return steps
 
 
@@ -96,7 +109,7 @@ def _basis(columns: np.ndarray) -> np.ndarray:
 
 
 def _as_recovery(
-    problem: GainProblem, steps: int, rows: Rows, radius: dict[int, float], width: np.ndarray, y: np.ndarray
+    problem: GainProblem, steps: int, rows: Rows, radius: dict[int, float], width: np.ndarray, scales: np.ndarray
 ) -> Recovery:
     """Rows of one length in the units of the plant."""
     n, l, R = problem.n, problem.l, len(radius)
@@ -106,6 +119,7 @@ def _as_recovery(
     else:
         targets = tuple(rows.states)
         multipliers, known = np.zeros((0, R, n + l)), np.zeros((0, R, len(problem.dd)))
+        y = np.where(problem.dv > 0, problem.dv, 1.0)
         remainder = width[list(targets), None] * np.array(rows.parts)[:, l:] / (np.abs(problem.T2) @ y)
     return Recovery(
         multipliers=multipliers,
@@ -114,7 +128,7 @@ def _as_recovery(
         known=known,
         constant=Interval.unchecked(np.zeros(R), np.zeros(R)),
         slack=np.zeros(R),
-        scales=1 / np.concatenate([width, y]),
+        scales=scales,
         floor=np.zeros(()),
         width=np.array([2 * radius[i] * width[i] for i in targets]),
         targets=targets,

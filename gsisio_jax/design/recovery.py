@@ -1,7 +1,7 @@
 """When do boxes become finite again: after lost rows of measurements, and from a state of which nothing is known?
 
-From an unknown state rows of `dead_beat` prove it for affine plants. All else is tried on the nominal trajectory; where f
-and g are affine, which boxes are infinite depends on no data, so the trial is the rule.
+From an unknown state rows of `dead_beat` prove it for affine plants. All else is tried on the nominal trajectory; where
+f and g are affine, which boxes are infinite depends on no data, so the trial is the rule.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _plain(steps: np.ndarray) -> tuple[float, ...]:
 
 
 class _Trial:
-    """A noise-free run from the centre of the region over n + 5 steps, and as many more, up to n, as it can be followed.
+    """A noise-free run from the centre of the region over n + 5 steps, and up to n more if it can be followed so long.
     In NumPy: a few steps take less time than the compilation of one."""
 
     def __init__(self, observer: Observer | DelayedObserver, start: np.ndarray, u: np.ndarray, rows: np.ndarray):

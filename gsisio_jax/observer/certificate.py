@@ -33,10 +33,10 @@ class Certificate(eqx.Module):
         equality_residual: largest entry of ``G - N_y H - N_z C G`` in the columns of free inputs.
         recoverable: after one lost row of measurements all boxes become finite again (None: not examined). State by
             state, from lost rows or from nothing: `rows_until_finite`.
-        recovery_steps: (n,) from the how manieth row of measurements on, counted from 0, a box is finite if nothing is
-            known of the state before (a start from R^n, lost rows, a conflict); ``inf``: not within n + 4 rows; () where
-            it was not examined. Proved where f and g have affine bounds, else tried without noise from the centre of
-            the region.
+        recovery_steps: (n,) the row of measurements, counted from 0, from which on a box is finite if nothing is known
+            of the state before (a start from R^n, any gap, a conflict); ``inf``: not within n + 4 rows; () where it was
+            not examined. Proved where f and g have affine bounds, else tried without noise from the centre of the
+            region.
         recovery_width: (n,) bound of the width of the box then, at the noise of the design (where it was tried: the
             width at the end of the trial).
         lost_row_steps: the same after 1, 2, ... lost rows between boxes that were finite; more rows than listed take

@@ -39,8 +39,8 @@ class Recovery(eqx.Module):
         known: (N, R, b).
         constant: boxes (R,) of what f and g have at 0.
         slack: (R,), what the rows leave of the states and inputs of all steps, by rounding.
-        scales: (n + l,), one over the units in which equations of the plant and outputs count for `size`; 0 for those
-            that no row uses.
+        scales: (N + 1, n + l), one over the units in which equations of the plant and outputs count for `size`, lag by
+            lag, those of y[k] last; 0 for those that no row uses.
         floor: (), least size: constants and bounded inputs.
         width: (R,), of boxes from these rows alone, at the noise of the design.
         targets: the state i of every row.
@@ -84,17 +84,17 @@ def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noi
     now = output_box(system, y, u, noise.v)
     total = plain_image(rows.output, widened_for_sums(now, terms))
     total = Interval.unchecked(total.lower + rows.constant.lower, total.upper + rows.constant.upper)
-    size = jnp.maximum(scale(rows.scales[system.n :], magnitude(now)).max(initial=0.0), rows.floor)
+    size = jnp.maximum(scale(rows.scales[-1, system.n :], magnitude(now)).max(initial=0.0), rows.floor)
     holds = jnp.asarray(True)
     for lag, step in enumerate(steps):
         weights = jnp.concatenate([rows.multipliers[lag], rows.known[lag]], -1)
         seen = past.known(observer, step, terms)
         part = plain_image(weights, seen)
         total = Interval.unchecked(total.lower + part.lower, total.upper + part.upper)
-        size = jnp.maximum(size, scale(rows.scales, magnitude(seen)[: len(rows.scales)]).max(initial=0.0))
+        size = jnp.maximum(size, scale(rows.scales[lag], magnitude(seen)[: system.n + system.l]).max(initial=0.0))
         holds = holds & step.trusted & step.believed
     if rounding.outward():
         total = plainly_wider(total, rounding.generous(scale(rows.slack, size)))
-    # A missing measurement makes the size infinite, and then nothing is known.
+    # A missing measurement that counts makes the size infinite, and then nothing is known.
     holds = holds & (size < jnp.inf)
     return by_state(everything_unless(holds, total), rows.targets, system.n)

@@ -271,6 +271,7 @@ class StepOutput(eqx.Module):
         status: `Status` bit mask.
         margin: signed slack of the tightest intersection.
         source: which one it was (`Source`).
+        kept: (l,) outputs that are in every largest set of outputs that agree; None unless wrong ones are tolerated.
     """
 
     state: Interval
@@ -279,3 +280,4 @@ class StepOutput(eqx.Module):
     status: Any
     margin: Any
     source: Any
+    kept: Any = None
