@@ -37,6 +37,9 @@ def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_reg
     steps, reached = np.full(n, np.inf), np.full(n, np.inf)
     for group in rows or ():
         steps[list(group.targets)], reached[list(group.targets)] = group.length, group.width
+    bounds = np.asarray(observer.system.state_bounds.width)
+    at_once = np.where(steps == 0, np.minimum(reached, bounds), bounds)
+    steps, reached = (np.where(np.isfinite(bounds), now, later) for now, later in ((0.0, steps), (at_once, reached)))
     proved = bool(np.isfinite(steps).all())
     trial = None if proved and n > _MOST_STATES else _Trial.of(observer, u_region)
     if trial is None:

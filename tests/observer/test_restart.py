@@ -16,7 +16,7 @@ ROWS, K = 8, 4
 def run():
     system = gx.System(lambda x: TURN @ x, lambda x: C @ x, G=[[1.0], [0.5]], H=np.zeros((4, 1)))
     noise = gx.Noise(Interval.symmetric([0.02, 0.02]), Interval.symmetric(np.full(4, 0.1)))
-    observer = gx.design_observer(system, noise, Interval.symmetric([5.0, 5.0]))
+    observer = gx.design_observer(system, noise, Interval.symmetric([5.0, 5.0]), sweeps=1)
     return jax.jit(jax.vmap(lambda y: gx.estimate(observer, Interval.symmetric([2.0, 2.0]), y)))
 
 
