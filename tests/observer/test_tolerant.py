@@ -86,7 +86,7 @@ def test_boxes_hold_the_hull_of_all_exact_sets(run):
             lower, upper = exact_hull(y[s, : k + 1])
             assert (box.lower[s, k] <= lower + 1e-9).all()
             assert (upper <= box.upper[s, k] + 1e-9).all()
-            assert (box.width[s, k] <= 1.6 * (upper - lower)).all()  # and are no wider than that
+            assert (box.width[s, k] <= 1.2 * (upper - lower)).all()  # and are no wider than that
 
 
 @pytest.mark.parametrize("runs", [RUNS, pytest.param(100_000, marks=pytest.mark.soak)])
