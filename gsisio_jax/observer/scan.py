@@ -55,9 +55,11 @@ def _advance(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, no
 
 def begin(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     """The first step, as a program of its own: smaller, as its past is known to say nothing."""
-    return once(
-        observer, lambda initial, *row: advance(observer, blank(observer, initial), *row, hold), initial, y, u, noise
-    )
+
+    def step(initial: Interval, y: Any, u: Any, noise: Noise) -> Any:
+        return advance(observer, blank(observer, initial), y, u, noise, hold)
+
+    return once(observer, step, initial, y, u, noise)
 
 
 def once(observer: AnyObserver, step: Callable[..., Any], *args: Any) -> Any:

@@ -187,10 +187,11 @@ def advance(
 
     last = replace(carry, older=())
 
+    def finished(domain: Domain, fallback: Domain, last: Carry, d: Interval, one: Any, u: Any, noise: Noise) -> Any:
+        return current_step._finish(maps, domain, fallback, last, d, one, u, noise, hold)
+
     def finish(domain: Domain, fallback: Domain, d: Interval, one: Any) -> Any:
-        return scalar.call(
-            lambda *parts: current_step._finish(maps, *parts, hold), domain, fallback, last, d, one, u, noise
-        )
+        return scalar.call(finished, domain, fallback, last, d, one, u, noise)
 
     first = jax.tree.map(lambda x: x[:count], (joined, fallback, d, measured))
     after, out = jax.vmap(finish)(*first)
