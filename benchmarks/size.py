@@ -10,7 +10,7 @@ import jax
 
 from benchmarks.plants import from_tests
 
-STAGES = ("known", "predict", "initial", "sweeps", "certified", "inputs", "finish", "other")
+STAGES = ("known", "predict", "initial", "sweeps", "certified", "inputs", "restart", "finish", "other")
 
 
 def main() -> None:

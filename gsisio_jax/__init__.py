@@ -13,6 +13,7 @@ from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.estimation import Estimate, estimate, start, step
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.status import Status
+from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.observer.types import Carry, Observer, StepOutput
 from gsisio_jax.plant.periodic import nearest, wrapped
 from gsisio_jax.plant.simulation import Simulation, simulate
@@ -45,6 +46,7 @@ __all__ = [
     "Status",
     "StepOutput",
     "System",
+    "TolerantObserver",
     "allocate",
     "dataset",
     "design_observer",

@@ -105,6 +105,6 @@ def _equations(jaxpr: Any, outer: str) -> Counter[str]:
         for part in inner:
             found += _equations(getattr(part, "jaxpr", part), scope)
         if not inner and eqn.primitive.name not in _NOT_COUNTED:
-            named = re.search(r"\b(known|predict|initial|sweeps|certified|inputs|finish)\b", scope)
+            named = re.search(r"\b(known|predict|initial|sweeps|certified|inputs|restart|finish)\b", scope)
             found[named.group() if named else "other"] += 1
     return found

@@ -30,6 +30,7 @@ from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_pre
 from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.region import find_region
 from gsisio_jax.design.slices import check_split, with_slices
+from gsisio_jax.design.tolerant import Guessed, check_tolerate, tolerant
 from gsisio_jax.design.undefined import undefined_in
 from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
@@ -41,6 +42,7 @@ from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.recovery_constants import AffineMaps
 from gsisio_jax.observer.rounding_constants import with_rounding_constants
+from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.observer.window_widths import WindowWidths
 from gsisio_jax.plant.system import Noise, System
@@ -63,7 +65,28 @@ def design_observer(
     delay: Literal[0] = 0,
     cells: int = 1,
     split: int | Literal["auto"] = 1,
+    tolerate: Literal[0] = 0,
 ) -> Observer: ...
+
+
+@overload
+def design_observer(
+    system: System,
+    noise: Noise,
+    region: Interval | Literal["auto"],
+    form: Literal["current"] = "current",
+    *,
+    gains: int = 1,
+    u_region: Interval | None = None,
+    missing: bool = True,
+    sweeps: int = 3,
+    bounds: Sequence[str] | None = None,
+    certify: bool = True,
+    window: int | Literal["auto"] = 1,
+    delay: Literal[0] = 0,
+    cells: int = 1,
+    tolerate: int,
+) -> Observer | TolerantObserver: ...
 
 
 @overload
@@ -119,7 +142,8 @@ def design_observer(
     delay: int | Literal["auto"] = 0,
     cells: int = 1,
     split: int | Literal["auto"] = 1,
-) -> Observer | PredictionObserver | DelayedObserver:
+    tolerate: int = 0,
+) -> Observer | PredictionObserver | DelayedObserver | TolerantObserver:
     """Design the gains of an interval observer offline, and certify the width of its boxes.
 
     Args:
@@ -162,6 +186,9 @@ def design_observer(
             slice by slice: boxes nearly as wide as the region then get the width promise that they keep anyway, where
             the largest slope of the region says more, or leaves the certificate empty. Costs operations in proportion.
             "auto" takes 4, 8 or 16, as long as widths shrink by 2 %, and 1 where slopes do not vary.
+        tolerate: q: boxes are certain even if up to q outputs of any one step are wrong, whichever these are. Outputs
+            are voted out: `Estimate.kept` says which agree. The result is a `TolerantObserver`; a step is as many
+            steps as there are choices of q wrong outputs in this and in the last measurement.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
@@ -178,6 +205,7 @@ def design_observer(
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
     check_cells(cells, form)
+    votes = check_tolerate(tolerate, system, form, missing, window, delay)
     given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
     check_split(split, form)
     if check_delay(delay, system, form):
@@ -209,6 +237,9 @@ def design_observer(
     bank = [main, *profile_bank(problem, main, box, gains - 1)]
     if missing or system.periodic:  # the multiple of a periodic output is chosen without that output
         bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
+    guessed = Guessed(problem, main, box, feedthrough, tolerate) if votes else None
+    if guessed is not None:
+        bank.extend(guessed.gains())
     bank = distinct([*bank, *gains_without_state_bounds(problem, main, box)])
     steady = problem.steady_width(bank[0])
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
@@ -232,13 +263,16 @@ def design_observer(
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
     maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
     if maps is not None:
-        observer = replace(observer, recovery=dead_beat_rows(problem, maps, width))
+        rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
+        observer = replace(observer, recovery=rows_alone)
     slices = observer.certificate.slices
     observer = with_rounding_constants(
         observer, system, first.slopes, everywhere, outputs, slack, maps, np.float64, slices
     )  # fmt: skip
     if certify:
         check_initial_contraction(problem, bank[0], observer, outputs)
+    if votes:
+        return tolerant(observer, tolerate)
     if not missing:
         return observer
     return replace(observer, certificate=with_recovery(observer, width, u_region))

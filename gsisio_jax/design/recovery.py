@@ -1,6 +1,7 @@
-"""When do boxes become finite again: after a lost row of measurements, and from a state of which nothing is known?
+"""When do boxes become finite again: after lost rows of measurements, and from a state of which nothing is known?
 
-Rows of `dead_beat` prove it for affine plants; for others it is tried on the nominal trajectory.
+From an unknown state rows of `dead_beat` prove it for affine plants. All else is tried on the nominal trajectory; where
+f and g are affine, which boxes are infinite depends on no data, so the trial is the rule.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.scalar.numpy_program import numpy_function
 
+_MOST_STATES = 12  # beyond, a trial takes seconds, and is left out where rows prove as much
+
 
 def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_region: Interval) -> Certificate:
-    """The certificate, with `recoverable`, `recovery_steps` and `recovery_width`.
+    """The certificate, with `recoverable`, `recovery_steps`, `recovery_width` and `lost_row_steps`.
 
     Args:
         observer: a finished observer.
@@ -31,27 +34,51 @@ def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_reg
         u_region: known inputs of the design; its centre is applied.
     """
     rows, n = (observer.inner if isinstance(observer, DelayedObserver) else observer).recovery, observer.system.n
-    if rows is not None:
-        return replace(
-            observer.certificate, recoverable=True, recovery_steps=(rows.length,) * n,
-            recovery_width=np.asarray(rows.width, np.float64),
-        )  # fmt: skip
-    trial = _Trial.of(observer, u_region)
+    steps, reached = np.full(n, np.inf), np.full(n, np.inf)
+    for group in rows or ():
+        steps[list(group.targets)], reached[list(group.targets)] = group.length, group.width
+    bounds = np.asarray(observer.system.state_bounds.width)
+    at_once = np.where(steps == 0, np.minimum(reached, bounds), bounds)
+    steps, reached = (np.where(np.isfinite(bounds), now, later) for now, later in ((0.0, steps), (at_once, reached)))
+    proved = bool(np.isfinite(steps).all())
+    trial = None if proved and n > _MOST_STATES else _Trial.of(observer, u_region)
     if trial is None:
-        return replace(observer.certificate, recoverable=False)
-    lost = trial.rows.copy()
-    lost[1] = np.nan
+        lost = (_plain(steps),) if proved else ()
+        return replace(
+            observer.certificate, recoverable=proved, lost_row_steps=lost,
+            recovery_steps=_plain(steps) if proved else (), recovery_width=reached if proved else None,
+        )  # fmt: skip
+    if not proved:
+        widths = trial.widths(observer.system.state_bounds, trial.rows)
+        steps, reached = _rows_until_finite(widths), widths[-1]
     around = Interval.unchecked(trial.start - width / 2, trial.start + width / 2)
-    recoverable = bool(np.isfinite(trial.widths(around, lost)[-1]).all())
-    widths = trial.widths(observer.system.state_bounds, trial.rows)
-    finite = np.isfinite(widths)
-    steps = tuple(float(np.argmax(column)) if column.any() else np.inf for column in finite.T)
-    return replace(observer.certificate, recoverable=recoverable, recovery_steps=steps, recovery_width=widths[-1])
+    found: list[tuple[float, ...]] = []
+    for count in range(1, trial.most_lost + 1):
+        after = trial.rows.copy()
+        after[1 : 1 + count] = np.nan
+        found.append(_plain(_rows_until_finite(trial.widths(around, after)[1 + count :])))
+        if found[-1] == _plain(steps):
+            break  # more rows cannot take more than all that was known
+    return replace(
+        observer.certificate, recoverable=bool(np.isfinite(found[0]).all()), recovery_steps=_plain(steps),
+        recovery_width=reached, lost_row_steps=tuple(found),
+    )  # fmt: skip
+
+
+def _rows_until_finite(widths: np.ndarray) -> np.ndarray:
+    """After how many of these rows (T, n) a box is finite and stays so, (n,); ``inf`` where the last one is not."""
+    infinite = np.isinf(widths)
+    count = np.where(infinite.any(0), len(widths) - np.argmax(infinite[::-1], 0), 0)
+    return np.where(infinite[-1], np.inf, count)
+
+
+def _plain(steps: np.ndarray) -> tuple[float, ...]:
+    return tuple(map(float, steps))
 
 
 class _Trial:
-    """A noise-free run from the centre of the region over n + 5 steps. In NumPy: a few steps take less time than the
-    compilation of one."""
+    """A noise-free run from the centre of the region over n + 5 steps, and up to n more if it can be followed so long.
+    In NumPy: a few steps take less time than the compilation of one."""
 
     def __init__(self, observer: Observer | DelayedObserver, start: np.ndarray, u: np.ndarray, rows: np.ndarray):
         self.observer, self.start, self.u, self.rows = observer, start, u, rows
@@ -71,13 +98,22 @@ class _Trial:
         with jax.enable_x64(True):
             start, u = (np.asarray(box.center, np.float64) for box in (observer.certificate.region, u_region))
             x, plant, rows = start, numpy_function(nominal, start, u), []
-            for _ in range(system.n + 5 + _delay(observer)):
+            least = system.n + 5 + _delay(observer)
+            while len(rows) < least + system.n:
                 y, x = plant(x, u)
+                if not np.isfinite(y).all():
+                    break
                 rows.append(y)
-        return cls(observer, start, u, np.array(rows)) if np.isfinite(rows).all() else None
+        return cls(observer, start, u, np.array(rows)) if len(rows) >= least else None
+
+    @property
+    def most_lost(self) -> int:
+        """So many rows can be lost, and n + 4 follow: after n of them no more becomes infinite."""
+        n = self.observer.system.n
+        return min(n, len(self.rows) - _delay(self.observer) - n - 4)
 
     def widths(self, initial: Interval, rows: np.ndarray) -> np.ndarray:
-        """Widths of the boxes of the first n + 5 steps, (n + 5, n)."""
+        """Widths of the boxes of all steps, (T, n)."""
         with jax.enable_x64(True):
             begin = known(initial, np.float64)
             carry = numpy_function(lambda box: blank(self.observer, box), begin)(begin)

@@ -17,10 +17,8 @@ from gsisio_jax.files.tree import encode
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.checks import AnyObserver
-from gsisio_jax.observer.delayed import DelayedObserver
-from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.scan import blank
-from gsisio_jax.observer.types import Carry, Observer
+from gsisio_jax.observer.types import Carry
 
 _OBSERVER = "it is what gx.design_observer or gx.load_observer returns"
 
@@ -40,7 +38,7 @@ def save_carry(path: str | os.PathLike[str], carry: Carry, observer: AnyObserver
     """
     call = "save_carry"
     check_type(call, "carry", carry, Carry, "it comes from gx.start, and then from every gx.step")
-    check_type(call, "observer", observer, (Observer, PredictionObserver, DelayedObserver), _OBSERVER)
+    check_type(call, "observer", observer, AnyObserver.__args__, _OBSERVER)
     if isinstance(step, bool) or not isinstance(step, int | np.integer) or step < 0:
         raise ValueError(f"{call}: `step` must be a number of measurements, at least 0, got {step!r}")
     if not all(map(is_concrete, jax.tree.leaves(carry))):
@@ -66,7 +64,7 @@ def load_carry(path: str | os.PathLike[str], observer: AnyObserver) -> tuple[Car
             another one, and in what; or the carry is in float64 and JAX knows only float32 here.
     """
     call = "load_carry"
-    check_type(call, "observer", observer, (Observer, PredictionObserver, DelayedObserver), _OBSERVER)
+    check_type(call, "observer", observer, AnyObserver.__args__, _OBSERVER)
     about, tree, arrays = read(call, path, "carry")
     saved, ours = about["observer"], digests(observer)
     differing = [name for name in {**saved, **ours} if saved.get(name) != ours.get(name)]

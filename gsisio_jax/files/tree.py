@@ -35,11 +35,12 @@ def _classes() -> dict[str, type]:
     from gsisio_jax.observer.certificate import Certificate
     from gsisio_jax.observer.delayed import DelayedObserver, Waiting
     from gsisio_jax.observer.prediction_step import PredictionObserver
+    from gsisio_jax.observer.tolerant import Guesses, TolerantObserver
     from gsisio_jax.plant.system import Noise, System
 
     found = (
         Abstraction, AffineForm, AtomBounds, Certificate, DelayedObserver, Interval, Noise, PredictionObserver, System,
-        Waiting,
+        Guesses, TolerantObserver, Waiting,
         bank.CancellationResidual, bank.LinearBounds, types.Carry, types.ExactInputs, types.InitialContraction,
         types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, slices.Slices, window.Window,
         window_widths.WindowWidths,

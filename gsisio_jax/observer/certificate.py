@@ -31,11 +31,16 @@ class Certificate(eqx.Module):
         self_consistent: all slacks are nonnegative; otherwise the boxes cannot be promised to stay in the region, and
             the certificate is empty.
         equality_residual: largest entry of ``G - N_y H - N_z C G`` in the columns of free inputs.
-        recoverable: after one lost row of measurements the boxes become finite again (None: not examined).
-        recovery_steps: (n,) after how many steps from the first measurement boxes are finite if nothing is known of the
-            state before (a start from R^n, lost rows, a conflict); ``inf``: not within n + 4 steps; () where it was not
-            examined. Proved where f and g have affine bounds, else tried without noise from the centre of the region.
-        recovery_width: (n,) width of the boxes then (of those at the end of the trial), at the noise of the design.
+        recoverable: after one lost row of measurements all boxes become finite again (None: not examined). State by
+            state, from lost rows or from nothing: `rows_until_finite`.
+        recovery_steps: (n,) the row of measurements, counted from 0, from which on a box is finite if nothing is known
+            of the state before (a start from R^n, any gap, a conflict); ``inf``: not within n + 4 rows; () where it was
+            not examined. Proved where f and g have affine bounds, else tried without noise from the centre of the
+            region.
+        recovery_width: (n,) bound of the width of the box then, at the noise of the design (where it was tried: the
+            width at the end of the trial).
+        lost_row_steps: the same after 1, 2, ... lost rows between boxes that were finite; more rows than listed take
+            what the last entry says. Tried; where f and g are affine the trial is the rule.
         window: what rows over several steps make of widths (`WindowWidths`), where f and g are affine; else None.
         slices: the slopes on parts of the region (`Slices`), where the design was asked to `split` it; else None. Then
             `next_width` and `steady_width` count them, and widths may settle where `rate` is above 1.
@@ -65,6 +70,7 @@ class Certificate(eqx.Module):
     framer: bool = eqx.field(static=True, default=True)
     recovery_steps: tuple[float, ...] = eqx.field(static=True, default=())
     recovery_width: Any = None
+    lost_row_steps: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())
     window: Any = None
     slices: Any = None
     input_noise_w: Any = None  # (p, n), weight of w in input boxes beside that of `input_state_now`; None: nothing
@@ -161,6 +167,29 @@ class Certificate(eqx.Module):
         known = noise.w.width @ of_w.T + noise.v.width @ self.input_noise_v.T
         return now @ self.input_state_now.T + before @ self.input_state_before.T + known + self.input_fixed
 
+    def rows_until_finite(self, lost: int | None = None) -> np.ndarray:
+        """From which row of measurements on the box of each state is finite again, counted from 0, (n,); ``inf``: it is
+        not within n + 4 rows.
+
+        Args:
+            lost: after so many lost rows in succession, at least 1; None: whatever was before (a start from R^n, a
+                conflict).
+
+        Raises:
+            ValueError: `lost` is no such number, or recovery was not examined (``missing=False`` in the design).
+        """
+        if lost is not None and (isinstance(lost, bool) or not isinstance(lost, int | np.integer) or lost < 1):
+            raise ValueError(
+                f"rows_until_finite: `lost` must be a number of rows, at least 1, or None (any state), got {lost!r}"
+            )
+        found = (self.recovery_steps,) if lost is None else self.lost_row_steps
+        if not found or not found[0]:
+            raise ValueError(
+                "rows_until_finite: the certificate must be that of a design with missing=True in the current form, "
+                "whose nominal trajectory stays where f and g have numbers; this one has nothing on recovery"
+            )
+        return np.array(found[-1 if lost is None else min(lost, len(found)) - 1])
+
     def __str__(self) -> str:
         lines = [self._headline()]
         lines.append(f"  rate {self.rate:.6g} per step · implicit part {self.implicit_rate:.3g} · equality residual "
@@ -175,21 +204,23 @@ class Certificate(eqx.Module):
             lines.append(f"  input {j + 1:<4}{width:>14.6g}{'-':>14}{'-':>14}")
         if self.recoverable is not None:
             lines.append(f"  a lost row of measurements is {'' if self.recoverable else 'NOT '}recovered from")
-        if self.recovery_steps:
-            lines.append(self._recovery())
+        if self.recovery_steps and self.lost_row_steps:
+            lines.extend(self._recovery())
         lines.extend(f"  note: {note}" for note in self.notes)
         return "\n".join(lines)
 
-    def _recovery(self) -> str:
-        """From a state of which nothing is known."""
-        steps = np.array(self.recovery_steps)
-        if np.isinf(steps).all():
-            return "  from an unknown state boxes stay infinite"
-        parts = [
-            f"state {i + 1} {'stays infinite' if np.isinf(after) else f'after {after:.0f} steps, width {width:.4g}'}"
-            for i, (after, width) in enumerate(zip(steps, np.asarray(self.recovery_width), strict=True))
-        ]
-        return f"  from an unknown state: {'; '.join(parts)}"
+    def _recovery(self) -> list[str]:
+        """From which row on a box is finite, by what was before."""
+        columns, most = {"1 lost row": self.lost_row_steps[0]}, len(self.lost_row_steps)
+        if self.lost_row_steps[-1] != self.lost_row_steps[0]:
+            columns[f"{most}+ lost rows"] = self.lost_row_steps[-1]
+        columns["any state"] = self.recovery_steps
+        lines = ["  boxes are finite from the row (0: the first measured one) after"]
+        lines.append("  " + " " * 10 + "".join(f"{name:>14}" for name in (*columns, "width then")))
+        for i, width in enumerate(np.asarray(self.recovery_width)):
+            steps = ("never" if np.isinf(column[i]) else f"{column[i]:.0f}" for column in columns.values())
+            lines.append(f"  state {i + 1:<4}" + "".join(f"{text:>14}" for text in (*steps, f"{width:.6g}")))
+        return lines
 
     def _headline(self) -> str:
         if not self.framer:

@@ -13,10 +13,11 @@ from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.interval.rounding import Rounding, check_rounding
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.prediction_step import PredictionObserver
+from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise
 
-AnyObserver = Observer | PredictionObserver | DelayedObserver
+AnyObserver = Observer | PredictionObserver | DelayedObserver | TolerantObserver
 
 
 def check_on_conflict(call: str, on_conflict: str) -> bool:
@@ -33,6 +34,16 @@ def rounded(call: str, observer: AnyObserver, rounding: Rounding | None) -> AnyO
         return observer
     check_rounding(call, rounding)
     return observer if observer.rounding == rounding else observer.with_rounding(rounding)
+
+
+def refuse_tolerant(call: str, observer: AnyObserver) -> None:
+    """For calls that hold the boxes of a step against its truth while it runs, and know a single step a row alone."""
+    if isinstance(observer, TolerantObserver):
+        raise ValueError(
+            f"{call}: the observer tolerates wrong outputs ({observer.tolerate} a step), so its box is that of many "
+            "steps. gx.estimate takes it, also over many cases: jax.vmap(lambda noise: gx.estimate(observer, "
+            "initial, y, noise=noise))(noises)"
+        )
 
 
 def check_length(length: Any, rows: int) -> None:

@@ -10,7 +10,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax import scalar
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.interval.rounding import Rounding
@@ -18,7 +17,7 @@ from gsisio_jax.observer.alarms import Alarm, read_alarms
 from gsisio_jax.observer.checks import AnyObserver, check_length, check_on_conflict, normal, prepare
 from gsisio_jax.observer.delayed import DelayedObserver, to_the_end
 from gsisio_jax.observer.fixed import Fixed, chosen, fixed
-from gsisio_jax.observer.scan import advance, begin, blank, cut, scan
+from gsisio_jax.observer.scan import advance, begin, blank, cut, once, scan
 from gsisio_jax.observer.types import Carry, StepOutput, cast
 from gsisio_jax.plant.system import Noise
 
@@ -41,6 +40,8 @@ class Estimate(eqx.Module):
             prediction form, whose boxes hold up to rounding errors (where they are framers at all).
         delay: L of an observer with a delay: the box of x[k] is from y[0..k+L], that of d[k] from y[0..k+1+L]. The
             last L rows lack measurements, so they have the status MISSING and may be infinite.
+        kept: (T, l) of an observer that tolerates wrong outputs: those that are in every largest set of outputs that
+            agree with each other and with the past; False also for missing ones. Else None.
 
     Source: theory 8 and 11.
     """
@@ -54,6 +55,7 @@ class Estimate(eqx.Module):
     output_rows: tuple[tuple[int, ...], ...] = eqx.field(static=True)
     guaranteed: bool = eqx.field(static=True, default=True)
     delay: int = eqx.field(static=True, default=0)
+    kept: Any = None
 
     def alarms(self) -> list[Alarm]:
         """Every step whose data contradict the stated bounds, in order, with what emptied and by how much.
@@ -243,7 +245,7 @@ def _start(static: Fixed | None, traced: Any, initial: Interval, y: Any, u: Any,
 def _step(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
     _, noise = normal(carry.state, noise)
-    return scalar.call(lambda c, y, u, noise: advance(observer, c, y, u, noise, hold), carry, y, u, noise)
+    return once(observer, lambda c, y, u, noise: advance(observer, c, y, u, noise, hold), carry, y, u, noise)
 
 
 @partial(jax.jit, static_argnames=("static", "hold"))
@@ -257,5 +259,5 @@ def _as_estimate(observer: AnyObserver, out: StepOutput) -> Estimate:
     out = jax.tree.map(lambda rows: rows[delay:], out) if delay else out  # the first rows finish no step
     return Estimate(
         out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows,
-        observer.guaranteed, delay,
+        observer.guaranteed, delay, out.kept,
     )  # fmt: skip

@@ -26,7 +26,7 @@ from gsisio_jax.plant.system import Noise
 
 
 class Recovery(eqx.Module):
-    """R rows for single states from measurements, known inputs and noise of the last N steps; lag t is step k-1-t.
+    """R rows for single states from measurements, known inputs and noise of N steps and of now; lag t is step k-1-t.
 
         x_i in sum over t of {multipliers [B u + w; D u + v - y]}[k-1-t] + output (y - D u - v)[k] + constant
                + sum over t of known (bounded inputs)[k-1-t]  +-  slack size
@@ -39,10 +39,10 @@ class Recovery(eqx.Module):
         known: (N, R, b).
         constant: boxes (R,) of what f and g have at 0.
         slack: (R,), what the rows leave of the states and inputs of all steps, by rounding.
-        scales: (n + l,), one over the units in which equations of the plant and outputs count for `size`; 0 for those
-            that no row uses.
+        scales: (N + 1, n + l), one over the units in which equations of the plant and outputs count for `size`, lag by
+            lag, those of y[k] last; 0 for those that no row uses.
         floor: (), least size: constants and bounded inputs.
-        width: (n,), of boxes from these rows alone, at the noise of the design.
+        width: (R,), of boxes from these rows alone, at the noise of the design.
         targets: the state i of every row.
     """
 
@@ -65,24 +65,36 @@ class Recovery(eqx.Module):
 
 @jax.named_scope("recovery")
 def contract(observer: Any, domain: Domain, carry: Any, y: Any, u: Any, noise: Noise) -> Domain:
-    """Contract the box of x[k] with every row; they hold as long as all measurements of the N steps are believed."""
-    rows, system = observer.recovery, observer.system
-    steps = (past.last(carry, None), *carry.older[: rows.length - 1])
+    """Contract the box of x[k] with all rows; they hold as long as all measurements of their steps are believed."""
+    for rows in observer.recovery:
+        domain = domain.intersect(_boxes(observer, rows, carry, y, u, noise), Source.STATE)
+    return domain
+
+
+def covers_all(observer: Any) -> bool:
+    """Is there a row for every state?"""
+    return len({i for rows in observer.recovery or () for i in rows.targets}) == observer.system.n
+
+
+def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noise) -> Interval:
+    """What rows of one length say of x[k], (1, n)."""
+    system = observer.system
+    steps = (past.last(carry, None), *carry.older)[: rows.length]
     terms = rows.length * rows.multipliers.shape[-1] + system.l + rows.known.shape[-1] * rows.length + 4
     now = output_box(system, y, u, noise.v)
     total = plain_image(rows.output, widened_for_sums(now, terms))
     total = Interval.unchecked(total.lower + rows.constant.lower, total.upper + rows.constant.upper)
-    size = jnp.maximum(scale(rows.scales[system.n :], magnitude(now)).max(initial=0.0), rows.floor)
+    size = jnp.maximum(scale(rows.scales[-1, system.n :], magnitude(now)).max(initial=0.0), rows.floor)
     holds = jnp.asarray(True)
     for lag, step in enumerate(steps):
         weights = jnp.concatenate([rows.multipliers[lag], rows.known[lag]], -1)
         seen = past.known(observer, step, terms)
         part = plain_image(weights, seen)
         total = Interval.unchecked(total.lower + part.lower, total.upper + part.upper)
-        size = jnp.maximum(size, scale(rows.scales, magnitude(seen)[: len(rows.scales)]).max(initial=0.0))
+        size = jnp.maximum(size, scale(rows.scales[lag], magnitude(seen)[: system.n + system.l]).max(initial=0.0))
         holds = holds & step.trusted & step.believed
     if rounding.outward():
         total = plainly_wider(total, rounding.generous(scale(rows.slack, size)))
-    # A missing measurement makes the size infinite, and then nothing is known.
+    # A missing measurement that counts makes the size infinite, and then nothing is known.
     holds = holds & (size < jnp.inf)
-    return domain.intersect(by_state(everything_unless(holds, total), rows.targets, system.n), Source.STATE)
+    return by_state(everything_unless(holds, total), rows.targets, system.n)

@@ -93,6 +93,12 @@ class Equations:
         rows = np.concatenate([*[np.concatenate([x, y])] * steps, z])
         return cls(M, radius, rows, np.concatenate([*[x] * (steps + 1), *[d] * steps]))
 
+    def without(self, lost: np.ndarray) -> Equations:
+        """Those in the mask (rows,) say nothing."""
+        return replace(
+            self, matrix=np.where(lost[:, None], 0, self.matrix), radius=np.where(lost[:, None], 0, self.radius)
+        )
+
     def determined(self) -> tuple[np.ndarray, np.ndarray]:
         """A row m (columns, rows) for every entry of X, and which of them give it."""
         scaled = self.matrix / self.rows[:, None] * self.columns
@@ -128,13 +134,18 @@ def with_constants(
     """
     n, l, N, R = system.n, system.l, found.length, len(found.targets)
     G, H, slack = (np.asarray(M, np.float64)[:, free] for M in (system.G, system.H, H_slack))
-    units = np.where(found.scales > 0, 1 / np.where(found.scales > 0, found.scales, 1.0), 1.0)
+    weight = found.scales.max(0)
+    units = np.where(weight > 0, 1 / np.where(weight > 0, weight, 1.0), 1.0)
     z = np.abs(T2) @ units[n:]
     equations = Equations.of(maps, G, H, N, units[:n], units[n:], z)
+    unused = found.scales == 0  # not to be relied on: a measurement that may be missing
+    lost = np.concatenate([unused[:N][::-1].ravel(), (T2[:, unused[N, n:]] != 0).any(1)])
+    equations = equations.without(lost)
     off = np.zeros_like(equations.matrix)  # what M is off by because H is
     for j in range(N):
         d_j = (N + 1) * n + j * slack.shape[1]
         off[j * (n + l) + n : (j + 1) * (n + l), d_j : d_j + slack.shape[1]] = slack
+    off[lost] = 0
     # Rows in the order of the equations: what multiplies g has the other sign.
     weights = found.multipliers[::-1] * np.concatenate([np.ones(n), -np.ones(l)])
     weights = np.concatenate([weights.transpose(1, 0, 2).reshape(R, -1), found.remainder], 1)
@@ -149,8 +160,8 @@ def with_constants(
     entry = 4 * (np.abs(every[needed]) @ equations.rows / equations.columns[needed]).max(initial=0.0) * _UP
 
     used = (np.concatenate([every[needed], weights]) != 0).any(0)
-    by_entry = used[: N * (n + l)].reshape(N, n + l).any(0)
-    by_entry[n:] |= (T2[used[N * (n + l) :]] != 0).any(0)
+    now = np.concatenate([np.zeros(n, bool), (T2[used[N * (n + l) :]] != 0).any(0)])
+    by_entry = np.vstack([used[: N * (n + l)].reshape(N, n + l)[::-1], now])
     sign = np.concatenate([np.ones(n), -np.ones(l + len(T2))])
     offset, around = (
         np.concatenate([*[part[: n + l]] * N, part[n + l :]]) for part in (maps.center * sign, maps.radius)

@@ -72,7 +72,7 @@ def single_precision(observer: Observer) -> Observer:
 
     slopes = slopes_of(system, narrow.T2, u_region, np.float32)
     region = slopes(observer.certificate.region)
-    affine = None if observer.recovery is None else AffineMaps.of(system, narrow.T2, np.float32)
+    affine = AffineMaps.of(system, narrow.T2, np.float32) if observer.recovery else None
     found = with_rounding_constants(
         narrow, system, region, slopes(system.state_bounds), *first_form(system, narrow.T2, u_region, np.float32),
         affine, np.float32, _slices(narrow, slopes),
@@ -156,7 +156,7 @@ def with_rounding_constants(
     if window is not None:
         left_x, left_d = window_residual(window, system, wide.C, wide.bounded_inputs, H_slack)
         window = _cast_window(window, left_x, left_d, wide.T2, dtype)
-    recovery = None if affine is None else _recovery(wide, system, affine, H_slack, dtype)
+    recovery = [_recovery(rows, wide, system, affine, H_slack, dtype) for rows in wide.recovery or () if affine]
     first = InitialContraction(
         form=None if system.g_takes_u else jax.tree.map(lambda x: np.asarray(x, dtype), form),
         slack=_cast(slack, dtype),
@@ -179,7 +179,7 @@ def with_rounding_constants(
         rounding_constants=rounding_constants,
         region_inverse=_cast(inverse, dtype),
         window=window,
-        recovery=recovery,
+        recovery=tuple(rows for rows in recovery if rows is not None),
         corrections=_corrections(spectral_radius(implicit)) if certificate.promised else 0,
         certificate=certificate,
     )
@@ -213,11 +213,9 @@ def _cast_window(window: Any, left_x: np.ndarray, left_d: np.ndarray, T2: np.nda
     return replace(stored, left_x=_cast(left_x, dtype), left_d=_cast(left_d, dtype))
 
 
-def _recovery(wide: Any, system: Any, affine: AffineMaps, H_slack: np.ndarray, dtype: Any) -> Any:
-    """The rows of recovery, as `_cast_window`; None where they do not hold in that type."""
-    if wide.recovery is None:
-        return None
-    rows = replace(wide.recovery, output=_rounded_once(wide.recovery.remainder, wide.T2))
+def _recovery(rows: Any, wide: Any, system: Any, affine: AffineMaps, H_slack: np.ndarray, dtype: Any) -> Any:
+    """Rows of recovery, as `_cast_window`; None where they do not hold in that type."""
+    rows = replace(rows, output=_rounded_once(rows.remainder, wide.T2))
     rows = jax.tree.map(lambda x: np.asarray(x, dtype).astype(np.float64), rows)
     free = ~(wide.bounded_inputs != 0).any(0)
     found = with_constants(rows, system, affine, wide.T2, H_slack, free, dtype)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -10,12 +11,13 @@ import jax.numpy as jnp
 
 from gsisio_jax import scalar
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer import delayed, prediction_step
+from gsisio_jax.observer import delayed, prediction_step, tolerant
 from gsisio_jax.observer import step as current_step
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.fixed import Fixed, chosen, fixed
 from gsisio_jax.observer.prediction_step import PredictionObserver
+from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.observer.types import Carry, StepOutput
 from gsisio_jax.plant.system import Noise
 
@@ -27,7 +29,10 @@ def scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold
         y_k, u_k, now = row
         return advance(observer, carry, y_k, u_k, noise_of_row(noise, now), hold)
 
-    return scalar.scan(body, carry, (y, u, noise_rows(noise)), length=y.shape[0])
+    rows = y, u, noise_rows(noise)
+    if isinstance(observer, TolerantObserver):  # many copies of one step: over arrays
+        return jax.lax.scan(body, carry, rows, length=y.shape[0])
+    return scalar.scan(body, carry, rows, length=y.shape[0])
 
 
 def blank(observer: AnyObserver, initial: Interval) -> Carry:
@@ -50,18 +55,23 @@ def _advance(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, no
 
 def begin(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     """The first step, as a program of its own: smaller, as its past is known to say nothing."""
-    return scalar.call(
-        lambda initial, y, u, noise: advance(observer, blank(observer, initial), y, u, noise, hold),
-        initial,
-        y,
-        u,
-        noise,
-    )
+
+    def step(initial: Interval, y: Any, u: Any, noise: Noise) -> Any:
+        return advance(observer, blank(observer, initial), y, u, noise, hold)
+
+    return once(observer, step, initial, y, u, noise)
+
+
+def once(observer: AnyObserver, step: Callable[..., Any], *args: Any) -> Any:
+    """One step as a program."""
+    return step(*args) if isinstance(observer, TolerantObserver) else scalar.call(step, *args)
 
 
 def _module(observer: AnyObserver) -> Any:
     if isinstance(observer, DelayedObserver):
         return delayed
+    if isinstance(observer, TolerantObserver):
+        return tolerant
     return prediction_step if isinstance(observer, PredictionObserver) else current_step
 
 

@@ -24,6 +24,7 @@ class Status(enum.IntFlag):
     CROSSED = 16  # prediction form only: the printed recursion lost its order
     AMBIGUOUS = 32  # periodic outputs only: several multiples of the period fit, so the entry says less, or nothing
     PENDING = 64  # observers with a delay, online: the step that this one would finish lies before the record
+    OUTVOTED = 128  # `tolerate` only: not all outputs agree, and one is left out or in doubt
 
 
 def bit_mask(bits: Iterable[tuple[Any, Status]]) -> Any:

@@ -16,7 +16,7 @@ from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, nan_to_unbounded
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
-from gsisio_jax.observer import cells, periodic, recovery, window
+from gsisio_jax.observer import cells, periodic, recovery, restart, window
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
@@ -55,8 +55,8 @@ def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold
     """One step (theory 5). Arrays must have their final dtype.
 
     After a conflict the recursion goes on from a box that does not contain the contradiction. Restart believes that the
-    state is elsewhere: y[k] and the state bounds alone, or, where these give no whole box, nothing up to k. `hold`
-    believes the past: outputs that contradict it are taken as missing.
+    state is elsewhere: y[k] (the largest set of its outputs that agrees) and the state bounds alone, or, where these
+    give no whole box, nothing up to k. `hold` believes the past: outputs that contradict it are taken as missing.
 
     Returns:
         The next `Carry`, and a `StepOutput`.
@@ -69,6 +69,9 @@ def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold
     domain, fallback, d = _contract(maps, carry, y, u, noise)
     if hold:
         fallback, kept = _held(maps, carry, y, u, noise)
+        y = jnp.where(domain.conflict, kept, y)
+    elif restart.can_disagree(observer):
+        fallback, kept = restart.agreeing(maps, fallback, y, u, noise)
         y = jnp.where(domain.conflict, kept, y)
     return _finish(maps, domain, fallback, carry, d, y, u, noise, hold)
 
@@ -124,7 +127,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         nothing = Domain.of(typed(bounds, y.dtype), size)
         alone = _output(nothing, maps.states(bounds), first.on(bounds), known.z)
         domain = nothing.intersect(everything_unless(carry.starts, before)[None], Source.INITIAL)
-        if observer.recovery is not None:
+        if observer.recovery:
             domain = recovery.contract(observer, domain, carry, y, u, noise)
         domain = _output(domain, maps.states(domain.box), first.on(domain.box), known.z)
         lost = Lost(observer, d_fixed)
@@ -212,10 +215,10 @@ def _finish(
     # Even the fallback may contradict itself (y[k] against the state bounds): then only the state bounds are left. So
     # they are where it is no whole box and later rows give one: if y[k] is what was wrong, none of them would tell.
     nothing = fallback.conflict
-    if observer.recovery is not None and not hold:
+    if observer.recovery and recovery.covers_all(observer) and not hold:
         nothing = nothing | ~_whole(fallback.box)
-    restart = choose(nothing, typed(system.state_bounds, dtype), fallback.box)
-    state = _limited(choose(conflict, restart, domain.box))
+    again = choose(nothing, typed(system.state_bounds, dtype), fallback.box)
+    state = _limited(choose(conflict, again, domain.box))
     believed = ~conflict if hold else ~conflict | ~nothing
 
     d = choose(conflict, typed(system.input_bounds, dtype), d)

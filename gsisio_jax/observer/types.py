@@ -126,7 +126,7 @@ class Observer(eqx.Module):
         sweeps: how often the box is contracted in a step.
         rounding_constants: what the gains leave by rounding.
         window: rows over several steps (`observer.window.Window`), or None.
-        recovery: rows that need no box to begin with (`observer.recovery.Recovery`), or None.
+        recovery: rows that need no box to begin with (`observer.recovery.Recovery`), those of one length together.
         corrections: Newton steps to the point that the certified bound is around (theory 5.6).
         cells: into how many parts the box of every state is cut for the outputs (`observer.cells`); () for none.
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
@@ -154,7 +154,7 @@ class Observer(eqx.Module):
     bounds: tuple[str, ...] = eqx.field(static=True)
     sweeps: int = eqx.field(static=True)
     window: Any = None
-    recovery: Any = None
+    recovery: Any = ()
     corrections: int = eqx.field(static=True, default=0)
     cells: tuple[int, ...] = eqx.field(static=True, default=())
     rounding: Rounding = eqx.field(static=True, default="outward")
@@ -275,6 +275,7 @@ class StepOutput(eqx.Module):
         status: `Status` bit mask.
         margin: signed slack of the tightest intersection.
         source: which one it was (`Source`).
+        kept: (l,) outputs that are in every largest set of outputs that agree; None unless wrong ones are tolerated.
     """
 
     state: Interval
@@ -283,3 +284,4 @@ class StepOutput(eqx.Module):
     status: Any
     margin: Any
     source: Any
+    kept: Any = None

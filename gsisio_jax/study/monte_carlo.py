@@ -116,6 +116,7 @@ def monte_carlo(
     """
     need("xarray", extra="study", purpose="a Monte Carlo study")
     observer = checks.rounded(CALL, observer, rounding)
+    checks.refuse_tolerant(CALL, observer)
     hold = checks.check_on_conflict(CALL, on_conflict)
     if on_miss not in ("raise", "record"):
         raise ValueError(f'{CALL}: `on_miss` must be "raise" or "record", got {on_miss!r}')

@@ -2,100 +2,18 @@
 determine the state at all, and certain."""
 
 from fractions import Fraction
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from recovery_plants import PLANTS, designed, records, steps_until_determined
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
-ROWS, FAULT = 30, 10
-C_, S_ = 0.95 * np.cos(0.3), 0.95 * np.sin(0.3)
-
-
-def plant(A, C, G=None, H=None, w=0.02, v=0.1):
-    A, C = np.atleast_2d(A).astype(float), np.atleast_2d(C).astype(float)
-    n, l = len(A), len(C)
-    G = np.zeros((n, 0)) if G is None else np.atleast_2d(G).astype(float)
-    H = np.zeros((l, G.shape[1])) if H is None else np.atleast_2d(H).astype(float)
-    return A, C, G, H, np.broadcast_to(w, n).astype(float), np.broadcast_to(v, l).astype(float)
-
-
-def random_plant(seed):
-    """n = 2..6, of which an input drives some and biases an output."""
-    rng = np.random.default_rng(seed)
-    n = 2 + seed % 5
-    l, p = max(2, n - 1), 1 + (n > 4)
-    A = rng.normal(size=(n, n))
-    A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
-    G, H = rng.normal(size=(n, p)), np.zeros((l, p))
-    if p == 2:
-        G[:, 1], H[0, 1] = 0, 1
-    return plant(A, rng.normal(size=(l, n)), G, H)
-
-
-CHAIN = np.block(
-    [[np.eye(3), 0.2 * np.eye(3)], [0.6 * np.array([[-2, 1, 0], [1, -2, 1], [0, 1, -2.0]]), 0.9 * np.eye(3)]]
-)
-PLANTS = {
-    "one output": plant([[0, -0.5], [1, 1]], [[-2, 1]], w=[0.12, 0.02], v=0.2),
-    "rotation": plant([[C_, -S_], [S_, C_]], np.eye(2), v=[0.05, 2.0]),
-    "one state seen": plant([[C_, -S_], [S_, C_]], [[1, 0]]),
-    "chain": plant(
-        CHAIN, np.eye(6)[[0, 1, 2, 4]], np.eye(6)[:, [4]], w=0.01,
-    ),
-    "biased outputs": plant(
-        [[0.8, 0.2, 0], [-0.1, 0.9, 0.3], [0.05, -0.2, 0.7]], np.vstack([np.eye(3), [[1, 1, 0], [0, 1, -1]]]),
-        [[0.5, 0, 1], [0, 1, 0], [0, 0, 0.4]], np.vstack([np.eye(3), np.zeros((2, 3))]),
-    ),
-    **{f"random {seed}": random_plant(seed) for seed in range(5)},
-}  # fmt: skip
-
-
-@cache
-def designed(name):
-    A, C, G, H, w, v = PLANTS[name]
-    system = gx.System(lambda x: A @ x, lambda x: C @ x, G=G, H=H)
-    noise = gx.Noise(Interval.symmetric(w), Interval.symmetric(v))
-    return gx.design_observer(system, noise, Interval.symmetric(np.full(len(A), 5.0)), certify=False)
-
-
-def records(name, seeds, rows=ROWS, size=1.0):
-    """States (S, T, n) and measurements (S, T, l)."""
-    A, C, G, H, w, v = PLANTS[name]
-    rng = np.random.default_rng(seeds)
-    count = 1 if np.isscalar(seeds) else len(seeds)
-    x = rng.uniform(-2, 2, (count, len(A)))
-    states, seen = [], []
-    for _ in range(rows):
-        d = size * rng.normal(size=(count, G.shape[1]))
-        states.append(x)
-        seen.append(x @ C.T + d @ H.T + rng.uniform(-v, v, (count, len(C))))
-        x = x @ A.T + d @ G.T + rng.uniform(-w, w, x.shape)
-    return np.stack(states, 1), np.stack(seen, 1)
-
-
-def steps_until_determined(name):
-    """N such that y[0..N] determine x[N] whatever x[0] and the inputs are: no run that is not seen at all moves it."""
-    A, C, G, H, *_ = PLANTS[name]
-    n, p = G.shape
-    # Every state and output as a linear map of x[0] and all inputs.
-    for steps in range(n + 1):
-        size = n + (steps + 1) * p
-        x, rows = np.eye(n, size), []
-        for k in range(steps + 1):
-            d = np.zeros((p, size))
-            d[:, n + k * p : n + (k + 1) * p] = np.eye(p)
-            rows.append(C @ x + H @ d)
-            x, now = A @ x + G @ d, x
-        _, values, rest = np.linalg.svd(np.vstack(rows))
-        unseen = rest[int((values > 1e-9).sum()) :]
-        if np.abs(now @ unseen.T).max(initial=0.0) < 1e-9:
-            return steps
-    return None
+FAULT = 10
 
 
 def finite(box):
@@ -123,7 +41,9 @@ def test_boxes_are_finite_again_as_soon_as_the_state_is_determined(name):
     assert ok[0].all()
     assert np.flatnonzero(ok[2])[0] == N
     assert ok[2, N:].all()
-    assert max(observer.certificate.recovery_steps, default=N) == N
+    steps = observer.certificate.rows_until_finite()
+    assert max(steps, default=N) == N
+    np.testing.assert_array_equal(np.argmax(np.isfinite(width[2]), 0), steps)  # some states are known before others
     # A conflict may show one step late; nothing up to the step where it shows is believed.
     status = np.asarray(est.status)
     shown = np.flatnonzero(status[1] & gx.Status.CONFLICT)
@@ -136,7 +56,13 @@ def test_boxes_are_finite_again_as_soon_as_the_state_is_determined(name):
         assert est.state.contains(x[0])[run].all()
     assert (width[1:, -1] <= 1.05 * undisturbed[-1] + 1e-12).all()
     if N:  # what the certificate says of the first finite box
-        assert (width[2, N] <= np.asarray(observer.certificate.recovery_width) * (1 + 1e-6)).all()
+        first = width[2][steps.astype(int), np.arange(n)]
+        assert (first <= np.asarray(observer.certificate.recovery_width) * (1 + 1e-6)).all()
+    after = np.isinf(width[3, FAULT + 3 :])
+    np.testing.assert_array_equal(
+        np.where(after.any(0), len(after) - np.argmax(after[::-1], 0), 0),
+        observer.certificate.rows_until_finite(lost=3),
+    )
 
 
 @pytest.mark.parametrize(("name", "dtype"), [("one output", "float32"), ("chain", "float64"), ("chain", "float32")])
@@ -145,7 +71,7 @@ def test_rows_hold_for_inputs_and_states_of_any_size(name, dtype):
     observer, n, single = designed(name), len(PLANTS[name][0]), dtype == "float32"
     rng = np.random.default_rng(3)
     A, C, G, H, w, v = (np.asarray(part, np.longdouble) for part in PLANTS[name])
-    unknown = Interval.entire(n).astype(dtype)
+    unknown, steps = Interval.entire(n).astype(dtype), observer.certificate.recovery_steps
 
     @jax.jit
     def run(y, v):
@@ -154,7 +80,7 @@ def test_rows_hold_for_inputs_and_states_of_any_size(name, dtype):
 
     for size in (1.0, 30.0) if single else (1.0, 1e3, 1e6):
         x, states, seen = size * rng.normal(size=(500, n)).astype(np.longdouble), [], []
-        for _ in range(observer.recovery.length + 2):  # noise at its vertices
+        for _ in range(int(max(steps)) + 2):  # noise at its vertices
             d = size * rng.normal(size=(500, G.shape[1]))
             states.append(x)
             seen.append(x @ C.T + d @ H.T + v * rng.choice([-1, 1], (500, len(C))))
@@ -163,7 +89,7 @@ def test_rows_hold_for_inputs_and_states_of_any_size(name, dtype):
         rounded = y.astype(dtype)
         off = np.abs(rounded - y).max((0, 1))  # a measurement is the number that the machine holds
         box = run(rounded, np.asarray(v + off, np.float64) * (1 + 1e-12))
-        assert np.isfinite(box.width[:, observer.recovery.length :]).all()
+        assert np.isfinite(box.width[:, int(max(steps)) :]).all()
         states = np.stack(states, 1)
         # The plant itself is that of the type: its constants are off by half an ulp.
         slack = 40 * size * np.finfo(dtype).eps
@@ -174,7 +100,7 @@ def test_rows_hold_for_inputs_and_states_of_any_size(name, dtype):
 def test_what_rows_leave_is_bounded_by_what_is_measured(name):
     """A run without noise in fractions, its inputs a billion: the stored row misses the state, by less than its slack
     allows for measurements of that size."""
-    rows = designed(name).recovery
+    rows = designed(name).recovery[-1]
     A, C, G, H, *_ = (np.vectorize(Fraction, otypes=[object])(part) for part in PLANTS[name])
     exact = np.vectorize(Fraction, otypes=[object])
     rng, N, n, missed = np.random.default_rng(4), rows.length, len(A), []
@@ -187,7 +113,7 @@ def test_what_rows_leave_is_bounded_by_what_is_measured(name):
         outputs = exact(rows.multipliers[:, :, n:])
         found = exact(rows.output).dot(seen[-1]) - sum(outputs[t].dot(seen[N - 1 - t]) for t in range(N))
         left = [abs(found[r] - last[state]) for r, state in enumerate(rows.targets)]
-        size = max(rows.scales[n + j] * abs(float(y[j])) for y in seen for j in range(len(C)))
+        size = max(rows.scales.max(0)[n + j] * abs(float(y[j])) for y in seen for j in range(len(C)))
         allowed = rows.slack * size
         missed.append(np.array(left, float) / allowed)
     assert np.max(missed) <= 1
@@ -240,5 +166,5 @@ def test_bounded_nonlinearities_count_as_noise():
         x = x @ A.T + 0.1 * np.sin(x) + rng.uniform(-0.01, 0.01, x.shape)
     box = jax.vmap(lambda y: gx.estimate(observer, Interval.entire(2), y).state)(np.stack(seen, 1))
     assert box.contains(np.stack(states, 1)).all()
-    assert observer.certificate.recovery_steps == (1, 1)
+    assert observer.certificate.recovery_steps == (0, 1)
     assert (np.asarray(box.width[:, 1]) <= np.asarray(observer.certificate.recovery_width) * (1 + 1e-6)).all()

@@ -168,7 +168,7 @@ def test_a_miss_ends_the_study_and_names_the_run(observer):
     T2, banks = observer.T2 + 1.0, (observer.gains, observer.inverses)
     false = eqx.tree_at(
         lambda o: (o.T2, o.gains.output, o.inverses.output),
-        replace(observer, recovery=None), (T2, *(bank.remainder @ T2 for bank in banks)),
+        replace(observer, recovery=()), (T2, *(bank.remainder @ T2 for bank in banks)),
     )  # fmt: skip
     with pytest.raises(gx.ContainmentLost) as raised:
         carlo(false, runs=[3, 9])

@@ -1,0 +1,79 @@
+"""What a certificate says of recovery is what linear programs over whole records say: per state, from R^n and after
+lost rows."""
+
+import numpy as np
+import pytest
+from recovery_plants import PLANTS, designed
+from scipy.optimize import linprog
+
+import gsisio_jax as gx
+
+# An unknown input of these plants drives all states at once, so after a lost row no box is finite, but a combination of
+# states is, which boxes do not hold: they wait for the rows that need no box.
+SKEWED = ("random 1", "random 2", "random 3", "random 4")
+
+
+def exact_width(name, rows, state, start=np.inf):
+    """Width of the hull of a state at the last of these steps, all measurements 0 (those of a pattern False are lost),
+    the first state within +-start, the inputs free: the largest over all data, as noise and boxes are symmetric."""
+    A, C, G, H, w, v = PLANTS[name]
+    (l, n), p, T = C.shape, G.shape[1], len(rows)
+    size = T * (n + p + l) + (T - 1) * n
+    x, d, noise, drift = np.split(np.eye(size), np.cumsum([T * n, T * p, T * l]))
+    equal = [x[(k + 1) * n :][:n] - A @ x[k * n :][:n] - G @ d[k * p :][:p] - drift[k * n :][:n] for k in range(T - 1)]
+    equal += [
+        C @ x[k * n :][:n] + H @ d[k * p :][:p] + noise[k * l :][:l] for k, measured in enumerate(rows) if measured
+    ]
+    sides = np.concatenate([np.full(n, start), np.full((T - 1) * n + T * p, np.inf), np.tile(v, T), np.tile(w, T - 1)])
+    equal = np.vstack(equal) if equal else np.zeros((0, size))
+    found = linprog(
+        -x[(T - 1) * n + state], A_eq=equal, b_eq=np.zeros(len(equal)), bounds=np.stack([-sides, sides], 1),
+        method="highs",
+    )  # fmt: skip
+    assert found.status in (0, 2, 3, 4)
+    return -2 * found.fun if found.status == 0 else np.inf
+
+
+def first_finite(name, lost, rows_after, start):
+    n = len(PLANTS[name][0])
+    width = np.array([
+        [exact_width(name, [True] * (start < np.inf) + [False] * lost + [True] * (k + 1), i, start) for i in range(n)]
+        for k in range(rows_after)
+    ])  # fmt: skip
+    found = np.where(np.isfinite(width).any(0), np.argmax(np.isfinite(width), 0), np.inf)
+    return found, width
+
+
+@pytest.mark.parametrize("name", PLANTS)
+def test_every_state_is_known_when_the_exact_program_says_so(name):
+    certificate = designed(name).certificate
+    rows = int(max(certificate.recovery_steps)) + 1
+    steps, width = first_finite(name, 0, rows, np.inf)
+    np.testing.assert_array_equal(certificate.rows_until_finite(), steps)
+    exact = width[steps.astype(int), np.arange(len(steps))]
+    if rows > 1:  # rows of least noise: the width is that of the exact program
+        np.testing.assert_allclose(certificate.recovery_width, exact, rtol=1e-5)
+    else:
+        assert (np.asarray(certificate.recovery_width) <= exact * (1 + 1e-5)).all()
+    for lost in (1, 2, len(steps) + 1):
+        said, possible = certificate.rows_until_finite(lost), first_finite(name, lost, rows, 2.0)[0]
+        assert (possible <= said).all()
+        assert (said <= steps).all()
+        if name not in SKEWED:
+            np.testing.assert_array_equal(said, possible)
+
+
+def test_states_that_nothing_shows_are_named():
+    """The second state never shows; the first is measured."""
+    system = gx.System(lambda x: [0.5 * x[0], 0.9 * x[1]], lambda x: x[:1], G=np.zeros((2, 0)), H=np.zeros((1, 0)))
+    noise = gx.Noise(gx.Interval.symmetric([0.1, 0.1]), gx.Interval.symmetric([0.1]))
+    certificate = gx.design_observer(system, noise, gx.Interval.symmetric([2.0, 2.0])).certificate
+    np.testing.assert_array_equal(certificate.rows_until_finite(), [0, np.inf])
+    np.testing.assert_array_equal(certificate.rows_until_finite(lost=3), [0, 0])  # its box was finite, and stays so
+    assert "state 2                0         never" in str(certificate)
+    for wrong in (0, 1.5, True):
+        with pytest.raises(ValueError, match="rows_until_finite: `lost` must be a number of rows, at least 1"):
+            certificate.rows_until_finite(wrong)
+    without = gx.design_observer(system, noise, gx.Interval.symmetric([2.0, 2.0]), missing=False).certificate
+    with pytest.raises(ValueError, match="must be that of a design with missing=True"):
+        without.rows_until_finite()
