@@ -46,7 +46,8 @@ time,<signal>_lower,<signal>_upper,...,status  a PNG, and a report: one HTML fil
 
 exit codes: 0 done, 1 a simulated run was not held by its boxes (monte-carlo), 2 something in the
 command, the configuration, the table or the folder is wrong (one line says what, and no file is
-written), 130 interrupted (143: by SIGTERM).
+written), 3 the files are written, but nearly every step contradicts the stated bounds (estimate: wrong
+units?), 130 interrupted (143: by SIGTERM). Conflicts now and then are results, and exit code 0.
 
 docs/command-line.md explains init, long tables, --follow, the report and --format json.
 """
