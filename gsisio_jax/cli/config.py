@@ -42,14 +42,17 @@ class SignalsPart(Part):
 
 
 class RegionPart(Part):
-    """The box the gain is designed for, or ``auto = true``."""
+    """The box the gain is designed for, or ``auto = true``, around a state, a box, or the initial one."""
 
     auto: bool = False
+    around: list[Number] | Bounds | Literal["initial"] | None = None
     lower: list[Number] | None = None
     upper: list[Number] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> RegionPart:
+        if self.around is not None and not self.auto:
+            raise ValueError("around says where auto = true looks; leave it out, or lower and upper")
         if not self.auto:
             check_box(self.lower, self.upper, "needs both lower and upper, or auto = true")
         elif self.lower is not None or self.upper is not None:

@@ -35,13 +35,15 @@ class Outcome:
     u_outside: int = 0
 
 
-def design(problem: Problem) -> Any:
-    """Design the observer of a problem."""
+def design(problem: Problem, progress: bool | None = None) -> Any:
+    """Design the observer of a problem; `progress` as in `design_observer`, False where a bar is shown already."""
     import gsisio_jax as gx
 
-    options = dict(problem.design)
+    options = {**problem.design, "progress": progress}
     if problem.u_region is not None:
         options["u_region"] = problem.u_region
+    if problem.around is not None:
+        options["around"] = problem.around
     return gx.design_observer(problem.system, problem.noise, problem.region, **options)
 
 
@@ -76,7 +78,7 @@ def run(
     clock = time.perf_counter
     progress.stage("designing")
     began = clock()
-    observer = design(problem)
+    observer = design(problem, progress=False)
     design_seconds = clock() - began
     system = problem.system
     boxes = Boxes(record_type(system.n, system.p, system.l), checkpoint and checkpoint.begin)

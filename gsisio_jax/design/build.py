@@ -24,11 +24,14 @@ from gsisio_jax.design.gain_selection import (
     units,
 )
 from gsisio_jax.design.gains import optimal_gain
+from gsisio_jax.design.gains_with_less import gains_with_less
+from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
 from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
+from gsisio_jax.design.progress import Say, told
 from gsisio_jax.design.recovery import with_recovery
-from gsisio_jax.design.region import find_region
+from gsisio_jax.design.region import Around, find_region, grown_around, read_around
 from gsisio_jax.design.undefined import undefined_in
 from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
@@ -59,6 +62,8 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = 1,
     delay: Literal[0] = 0,
+    around: Around | None = None,
+    progress: bool | None = None,
 ) -> Observer: ...
 
 
@@ -77,6 +82,8 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = 1,
     delay: int | Literal["auto"],
+    around: Around | None = None,
+    progress: bool | None = None,
 ) -> Observer | DelayedObserver: ...
 
 
@@ -92,6 +99,8 @@ def design_observer(
     left_inverse: LeftInverse | Any = "pseudo",
     allow_uncertified: bool = False,
     derivative: Interval | None = None,
+    around: Around | None = None,
+    progress: bool | None = None,
 ) -> PredictionObserver: ...
 
 
@@ -111,6 +120,8 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = 1,
     delay: int | Literal["auto"] = 0,
+    around: Around | None = None,
+    progress: bool | None = None,
 ) -> Observer | PredictionObserver | DelayedObserver:
     """Design the gains of an interval observer offline, and certify the width of its boxes.
 
@@ -119,7 +130,7 @@ def design_observer(
         noise: constant bounds of w and v.
         region: convex box (n,) of states for which the gain is optimised and on which the width promise holds. It does
             not limit the observer: boxes are certain anywhere. Infinite sides are legal where f and g are affine or
-            have bounded slopes. "auto" looks for a region that fits its own steady width.
+            have bounded slopes. "auto" looks for a region that has room for its own steady width, see `around`.
         form: "current" uses y[k] for the box of x[k]; "prediction" is the paper's recursion, from y[0..k-1] alone, and
             takes none of `gains`, `missing` and `sweeps`.
         gains: size of the bank: the certified gain, and ``gains - 1`` more that are best for larger boxes.
@@ -147,6 +158,12 @@ def design_observer(
             positions are measured), or to smooth. Outputs, but for those of step k, must be affine in the state, and
             so must be for L >= 2 the parts of f that they see. "auto" takes the smallest L up to n that shows every
             unknown input. The result is a `DelayedObserver`; online its boxes come L steps late.
+        around: where region="auto" looks: a state (n,), a box (an `Interval` (n,), the initial one say), or a
+            trajectory: states (T, n) or boxes over time, as of a simulation or an earlier estimate. The region holds
+            all of it and the steady boxes there. None: the centre of the state bounds (0 where there are none); a run
+            elsewhere leaves such a region, which the certificate notes, and ``est.summary()`` counts.
+        progress: say on standard error what the design is at, once it has taken two seconds. None: where that is a
+            terminal.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
@@ -162,68 +179,113 @@ def design_observer(
 
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
-    given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
-    if check_delay(delay, system, form):
-
-        def inner(plant: System, noise: Noise, quick: bool) -> Observer:
-            return design_observer(
-                plant, noise, region, gains=1 if quick else gains, u_region=u_region, missing=missing and not quick,
-                sweeps=sweeps, bounds=bounds, certify=certify and not quick, window=1 if quick else window, delay=0,
-            )  # fmt: skip
-
-        return design_delayed(inner, system, noise, given, u_region, delay)
+    given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify, progress)
+    near = read_around(system, around, given is None)
+    late = check_delay(delay, system, form)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS
     methods = check_methods("design_observer", default if bounds is None else bounds)
-    if form == "prediction":
-        return design_prediction(system, noise, given, u_region, methods, left_inverse, allow_uncertified, derivative)
+    with told("design_observer", progress) as say:
+        if form == "prediction":
+            return design_prediction(
+                system, noise, given, u_region, methods, left_inverse, allow_uncertified, derivative, near
+            )
+
+        def design(plant: System, noise: Noise, quick: bool) -> Observer:
+            return _design(
+                plant, noise, given, near, 1 if quick else gains, u_region, missing and not quick, sweeps, methods,
+                certify and not quick, 1 if quick else window, say,
+            )  # fmt: skip
+
+        return design_delayed(design, system, noise, given, u_region, delay) if late else design(system, noise, False)
+
+
+def _design(
+    system: System,
+    noise: Noise,
+    given: Interval | None,
+    near: Interval | None,
+    gains: int,
+    u_region: Interval,
+    missing: bool,
+    sweeps: int,
+    methods: tuple[str, ...],
+    certify: bool,
+    window: int | Literal["auto"],
+    say: Say,
+) -> Observer:
+    """The current form, its arguments checked; `given` is the region, or None and it is looked for around `near`."""
+    say("bounding slopes")
     feedthrough = factorise(np.asarray(system.H))
     slopes_on = slopes_of(system, feedthrough.T2, u_region)
     everywhere = slopes_on(system.state_bounds)
     try:
         check_existence(system, feedthrough, everywhere)
     except ObserverDoesNotExist as error:
-        raise with_delay(error, system, u_region) from None
+        say("looking for what would help")
+        reason = with_delay(error, system, u_region)
+        ways = what_helps(Plan(system, noise, feedthrough, u_region), slopes_on, near if given is None else given)
+        raise type(reason)(f"{reason}{ways}") from None
     plan = Plan(system, noise, feedthrough, u_region)
-    box = _found_region(plan, slopes_on, certify) if given is None else given
+    say("looking for a region")
+    box = _found_region(plan, slopes_on, certify, near) if given is None else given
+    say("choosing gains")
     first = first_gain(plan, slopes_on, box, certify)
     problem, main = first.problem, first.gain
     bank = [main, *profile_bank(problem, main, box, gains - 1)]
     if missing or system.periodic:  # the multiple of a periodic output is chosen without that output
         bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
     bank = distinct([*bank, *gains_without_state_bounds(problem, main, box)])
+    bank = distinct([*bank, *gains_with_less(problem, bank, box)])
     steady = problem.steady_width(bank[0])
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
+    say("bounding unknown inputs")
     outputs, slack = first_form(system, feedthrough.T2, u_region)
     observer = assemble(plan, problem, box, bank, input_bounds(problem, width), everywhere.affine, methods, sweeps)
     if first.uncertified:
         observer = replace(observer, certificate=observer.certificate.without_promise(first.uncertified))
-    if not everywhere.affine and (why := undefined_in(system, box, u_region)):
-        certificate = observer.certificate
-        observer = replace(observer, certificate=replace(certificate, notes=(*certificate.notes, why)))
+    if not (first.uncertified or observer.certificate.certified):
+        way = what_settles(plan, slopes_on, box)
+        observer = replace(observer, certificate=observer.certificate.with_notes(way))
+    if not everywhere.affine:
+        found = (undefined_in(system, box, u_region), grown_around(near, box) if given is None else "")
+        observer = replace(observer, certificate=observer.certificate.with_notes(*found))
     if window != 1:
+        say("choosing rows over several steps")
         rows = window_rows(problem, window, width)
         observer = replace(observer, window=rows)
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
     maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
+    say("bounding what rounding leaves")
     if maps is not None:
         observer = replace(observer, recovery=dead_beat_rows(problem, maps, width))
     observer = with_rounding_constants(observer, system, first.slopes, everywhere, outputs, slack, maps, np.float64)
     if certify:
-        check_initial_contraction(problem, bank[0], observer, outputs)
+        try:
+            check_initial_contraction(problem, bank[0], observer, outputs)
+        except NoDesignFound as error:
+            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, box)}") from None
     if not missing:
         return observer
-    return replace(observer, certificate=with_recovery(observer, width, u_region))
+    say("trying what happens after a lost row")
+    certificate = with_recovery(observer, width, u_region)
+    if certificate.recoverable is False:
+        certificate = certificate.with_notes(what_recovers(plan, slopes_on, box))
+    return replace(observer, certificate=certificate)
 
 
-def _found_region(plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool) -> Interval:
+def _found_region(
+    plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool, near: Interval | None
+) -> Interval:
     """region="auto"; where there is none and no certificate is asked for, the point that the search began at."""
     try:
-        return find_region(plan.system, lambda box: _steady_width(plan, box, slopes_on(box)))
-    except NoDesignFound:
+        return find_region(plan.system, lambda box: _steady_width(plan, box, slopes_on(box)), near)
+    except NoDesignFound as error:
         if certify:
-            raise
+            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, near)}") from None
+        if near is not None:
+            return near
         center = np.asarray(plan.system.state_bounds.center, np.float64)
         return Interval(center, center)
 
