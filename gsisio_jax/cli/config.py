@@ -72,6 +72,7 @@ class DesignPart(Part):
 
     gains: Annotated[int, Field(ge=1)] | None = None
     missing: bool | None = None
+    certify: bool | None = None
     sweeps: Annotated[int, Field(ge=1)] | None = None
     window: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
     bounds: Annotated[list[str], Field(min_length=1)] | None = None

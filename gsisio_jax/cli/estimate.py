@@ -169,5 +169,9 @@ def _draw(outputs: OutputsPart, file: str) -> Callable[[Labelled, Path], None]:
 
 def _draw_plainly(labelled: Labelled, target: Path) -> Any:
     from ..plot import save
+    from ..plot.record import read_record
 
-    save(labelled.picture(), target)
+    dataset = labelled.picture()
+    record = read_record(dataset)
+    # Every measurement is shown: on the panel of its signal, or on one of its own.
+    save(dataset, target, [*record.series, *record.outputs])
