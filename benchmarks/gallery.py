@@ -17,6 +17,7 @@ import gsisio_jax as gx
 from benchmarks.throughput import peak
 
 NAMES = gx.examples.names()
+SETTLING = 20  # steps that the promise must have applied before widths count as settled
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -25,7 +26,7 @@ def plant(name: str, repeat: int, steps: int) -> dict[str, Any]:
 
     Ranges are those of the true states and inputs, and of the middles of the boxes where nobody knows the truth.
     Widths are medians over the second half of the record, against the range in percent; the certificate against the
-    largest width there, over the steps at which it applies. Design and first call are CPU seconds.
+    largest width there, over steps at which it has applied for a while. Design and first call are CPU seconds.
 
     Args:
         name: of the example.
@@ -49,6 +50,7 @@ def plant(name: str, repeat: int, steps: int) -> dict[str, Any]:
 
     certificate = observer.certificate
     applies = (np.asarray(est.status) & ~int(gx.Status.AMBIGUOUS)) == 0
+    applies = np.array([applies[max(k - SETTLING, 0) : k + 1].all() for k in range(len(applies))])
     states = _widths(est.state, record.x, applies, np.asarray(certificate.steady_width), gx.nearest, example.system)
     inputs = _widths(est.input, record.d, applies[1:], np.asarray(certificate.input_width))
     missed = 0
