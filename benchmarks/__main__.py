@@ -26,7 +26,12 @@ SIZES = {  # full, quick
     "peers horizon": ({"batch": 2_000, "steps": 30, "solved": 5}, {"batch": 200, "steps": 20, "solved": 2}),
     "study": ({"boxes": 1000, "levels": 1000, "steps": 100}, {"boxes": 100, "levels": 100, "steps": 50}),
     "rounding": ({"batch": 20_000, "steps": 100}, {"batch": 2_000, "steps": 50}),
+    "plants": ({"repeat": 20, "steps": 200}, {"repeat": 3, "steps": 50}),
 }
+PLANTS = (
+    "flight", "paper", "double_integrator", "quadruple_tank", "six_tanks", "unicycle", "heading", "battery", "building",
+    "sir", "tclab",
+)  # fmt: skip  # gx.examples.names(), without the import
 
 
 def cases(
@@ -50,6 +55,7 @@ def cases(
             for plant in ("s1", "s5")
             for dtype in ("float64", "float32")
         },
+        **{f"plants {name}": ("gallery", "plant", {"name": name, **size["plants"]}) for name in PLANTS},
         "startup import": ("startup", "importing", {}),
         "startup six tanks": ("startup", "tanks", size["tanks"]),
     }
@@ -148,6 +154,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         notes += [f"agrees to {r['gap']:.0e}"] if "gap" in r else []
         notes += [f"{r['to_bare']:.2f} of the rate of the bare kernel"] if "to_bare" in r else []
         notes += [f"outward / nearest {r['cost']:.2f}, wider by {r['inflation']:.1e}"] if "cost" in r else []
+        notes += [f"first call {r['first_call_seconds']:.1f} s"] if "first_call_seconds" in r else []
         notes += [f"design {r['design_seconds']:.1f} s"] if "design_seconds" in r else []
         notes += [f"ours / {other} {ratio:.2f}" for other, ratio in r.get("ratios", {}).items()]
         notes += [f"{other} left out: {reason}" for other, reason in r.get("left_out", {}).items()]

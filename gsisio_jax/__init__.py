@@ -2,7 +2,10 @@
 
 from typing import TYPE_CHECKING, Any
 
-from gsisio_jax import inclusion
+from gsisio_jax import (
+    _quiet,  # noqa: F401  # before everything that takes time to import
+    inclusion,
+)
 from gsisio_jax._version import __version__ as __version__
 from gsisio_jax.errors import ContainmentLost, FramerNotGuaranteed, NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval import Interval, hull, intersect, linear_image

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .._extras import MissingExtra, need
+from .._quiet import hear_interrupts
 from ..scalar.options import use_flags
 from .errors import Interrupted, UserError, reason
 from .help import EXAMPLES, INIT, MONTE_CARLO, SWEEP
@@ -141,14 +142,17 @@ def _estimate(options: argparse.Namespace) -> int:
     if config.table is None:
         raise UserError(f"{path.name}: table is missing; estimate needs measurements")
     _use_float64()
+
     if options.follow:
         from .follow import follow
 
+        hear_interrupts()
         return follow(options, path, config, config.table)
     if options.table == "-":
         raise UserError("standard input (-) is read as it comes: add --follow")
     from .estimate import estimate
 
+    hear_interrupts()
     return estimate(options, path, config, config.table)
 
 
@@ -159,6 +163,7 @@ def _design(options: argparse.Namespace) -> int:
     from .run import design
 
     _use_float64()
+    hear_interrupts()
     with importable(path.parent):
         problem = build_problem(config, path.name)
         certificate = design(problem).certificate
@@ -181,12 +186,14 @@ def _init(options: argparse.Namespace) -> int:
     need("pydantic", extra="cli", purpose="the command line")
     from .init import init
 
+    hear_interrupts()
     return init(Path(options.table), options.out)
 
 
 def _examples(options: argparse.Namespace) -> int:
     from .example_files import list_examples, write_example
 
+    hear_interrupts()
     if options.name is None:
         if options.out is not None:
             raise UserError("examples: --out needs the NAME of the example to write")
@@ -200,6 +207,7 @@ def _sweep(options: argparse.Namespace) -> int:
     from .study import sweep
 
     _use_float64()
+    hear_interrupts()
     return sweep(options, path, config)
 
 
@@ -208,6 +216,7 @@ def _monte_carlo(options: argparse.Namespace) -> int:
     from .study import monte_carlo
 
     _use_float64()
+    hear_interrupts()
     return monte_carlo(options, path, config)
 
 
@@ -215,6 +224,7 @@ def _reproduce(options: argparse.Namespace) -> int:
     from .reproduce import reproduce
 
     _use_float64()
+    hear_interrupts()
     return reproduce(options.out, options.progress)
 
 

@@ -42,14 +42,17 @@ class SignalsPart(Part):
 
 
 class RegionPart(Part):
-    """The box the gain is designed for, or ``auto = true``."""
+    """The box the gain is designed for, or ``auto = true``, around a state, a box, or the initial one."""
 
     auto: bool = False
+    around: list[Number] | Bounds | Literal["initial"] | None = None
     lower: list[Number] | None = None
     upper: list[Number] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> RegionPart:
+        if self.around is not None and not self.auto:
+            raise ValueError("around says where auto = true looks; leave it out, or lower and upper")
         if not self.auto:
             check_box(self.lower, self.upper, "needs both lower and upper, or auto = true")
         elif self.lower is not None or self.upper is not None:
@@ -69,6 +72,7 @@ class DesignPart(Part):
 
     gains: Annotated[int, Field(ge=1)] | None = None
     missing: bool | None = None
+    certify: bool | None = None
     sweeps: Annotated[int, Field(ge=1)] | None = None
     window: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
     split: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None

@@ -18,12 +18,14 @@ from .output import check_writable, write_all
 from .page import write_page
 from .problem import Problem, build_problem, importable, resolve
 from .progress import DelayedProgress
-from .report import Summary, show, summarise
+from .report import Summary, doubt, show, summarise
 from .totals import Totals, gather
 
 if TYPE_CHECKING:
     from .config import Config, OutputsPart, TablePart
     from .run import Outcome
+
+DOUBTFUL = 3  # exit code
 
 
 def estimate(options: argparse.Namespace, path: Path, config: Config, wanted: TablePart) -> int:
@@ -35,7 +37,7 @@ def estimate(options: argparse.Namespace, path: Path, config: Config, wanted: Ta
         wanted: its table.
 
     Returns:
-        The exit code.
+        The exit code: 0, or 3 where the files are written, but nearly every step contradicts the stated bounds.
     """
     from .run import run
 
@@ -88,7 +90,7 @@ def estimate(options: argparse.Namespace, path: Path, config: Config, wanted: Ta
         print(line(run_figures(title, problem, totals, outcome, table.notes, paths), indent=2))
     else:
         show(summary, sys.stdout)
-    return 0
+    return DOUBTFUL if doubt(totals) else 0
 
 
 def table_path(options: argparse.Namespace, path: Path, wanted: TablePart) -> Path:
@@ -111,7 +113,7 @@ def _write(
     from .output import write_csv, write_netcdf
 
     observer = outcome.observer
-    totals = gather(outcome.boxes.parts(), problem, observer.output_rows)
+    totals = gather(outcome.boxes.parts(), problem, observer)
     labelled = Labelled(problem, outcome.boxes, totals, title, observer.certificate)
     paths = {kind: out / name for kind, name in names.items()}
     summary = summarise(title, problem, totals, outcome, table.notes, paths.values())
@@ -167,5 +169,9 @@ def _draw(outputs: OutputsPart, file: str) -> Callable[[Labelled, Path], None]:
 
 def _draw_plainly(labelled: Labelled, target: Path) -> Any:
     from ..plot import save
+    from ..plot.record import read_record
 
-    save(labelled.picture(), target)
+    dataset = labelled.picture()
+    record = read_record(dataset)
+    # Every measurement is shown: on the panel of its signal, or on one of its own.
+    save(dataset, target, [*record.series, *record.outputs])

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._version import __version__
 from .problem import Names, Problem
-from .report import Notes, certificate_lines, promised
+from .report import Notes, certificate_lines, doubt, outside, promised
 from .run import Outcome
 from .totals import Totals
 
@@ -23,11 +23,14 @@ def run_figures(
 
     Returns:
         ``title``, ``library``, ``steps``, ``time`` (first and last, seconds), ``missing`` (rows without any and with
-        some entries missing), ``statuses`` (steps by bit), ``resumed`` (steps taken from an interrupted run), ``delay``
-        (L: boxes are from measurements up to L steps later), ``seconds``, ``table`` (what was found in the file and is
-        not plain), ``signals``, ``alarms`` (as in the NetCDF file, the first 10,000), ``alarm_count``, ``certificate``
-        (as of `certificate_figures`), ``files``.
+        some entries missing), ``statuses`` (steps by bit), ``outside`` (``steps`` without a promised width, because the
+        box of this or the last one is outside of the region at ``boxes`` of them, or u of `u_region` at ``inputs``),
+        ``doubt`` (text where nearly every step contradicts the bounds, else null), ``resumed`` (steps taken from an
+        interrupted run), ``delay`` (L: boxes are from measurements up to L steps later), ``seconds``, ``table`` (what
+        was found in the file and is not plain), ``signals``, ``alarms`` (as in the NetCDF file, the first 10,000), ``alarm_count``, ``certificate`` (as of `certificate_figures`),
+        ``files``.
     """
+    found = outside(totals, outcome)
     signals = [
         {
             "name": signal.name,
@@ -48,6 +51,8 @@ def run_figures(
         "time": {"first": totals.first, "last": totals.last},
         "missing": {"rows": totals.absent, "partly": totals.partly},
         "statuses": totals.statuses,
+        "outside": {"steps": found.outside, "boxes": found.boxes, "inputs": found.inputs},
+        "doubt": doubt(totals) or None,
         "resumed": outcome.resumed,
         "delay": outcome.boxes.delay,
         "seconds": {

@@ -20,7 +20,33 @@ examples:
 
 CONFIG is a TOML file. It names the system ("module:attribute", also a module beside the file), the
 noise bounds, the region, the initial box, the table of measurements (CSV or Parquet) and the outputs.
-The built-in examples are commented and meant to be copied.
+The built-in examples are commented and meant to be copied. All keys (those of sweep and monte_carlo are
+in their own --help):
+
+  title = "Pump"
+  [system]
+  use = "plant:pump"                 # a System, or a function that returns one, called with
+  arguments = {length = 3.0}         # these
+  periodic = {heading = 360.0}       # outputs that are logged modulo a period, and
+  periodic_states = {heading = 360.0}  # states that mean the same after one
+  [signals]                          # names and units, in order; left out: x1, d1, y1, u1, ...
+  state = [{name = "position", unit = "m"}]
+  input = [{name = "leak", unit = "l/s"}]  # likewise output, known_input
+  [noise]                            # bounds of the process noise w and of the measurement noise v
+  w = {radius = [0.01]}              # every box is {radius = [...]} or {lower = [...], upper = [...]},
+  v = {radius = [0.1]}               # one number for each component; inf where nothing is known
+  [region]                           # of states, for which gains are chosen and widths promised:
+  lower = [-1.0]                     # lower and upper, or
+  upper = [1.0]                      # auto = true and around = a state [...], a box, or "initial"
+  [u_region]                         # box of known inputs; needed where f or g takes u
+  [initial]                          # box of the first state
+  [design]                           # options of gx.design_observer, which explains them
+  gains = 1                          # also sweeps, window, missing, certify, bounds, form = "prediction",
+                                     # left_inverse, allow_uncertified
+  [estimate]
+  on_conflict = "restart"            # or "hold": what is believed after a contradiction
+  [outputs]                          # file names: netcdf, csv, picture, report; draw = "module:function"
+                                     # draws the picture, called with a Dataset and a path
 
 The table [table] says how the log is written; docs/logs.md explains every key:
 
@@ -38,6 +64,9 @@ The table [table] says how the log is written; docs/logs.md explains every key:
   on_duplicate = "mean"              # or first, last; on_unsorted = "sort", on_blank_time = "drop";
                                      # left out: such rows are errors
   sparse = true                      # most steps have no row, and that is meant
+  transform = "plant:clean"          # a function of the pandas.DataFrame, before all else
+  [table.dialect]                    # what is not found by looking: separator, decimal, thousands, comment,
+                                     # quote, header, encoding, skip, skip_after, compression
 
 estimate writes four files: a labelled NetCDF, a CSV with the columns
 time,<signal>_lower,<signal>_upper,...,status  a PNG, and a report: one HTML file. status is a sum of
@@ -46,7 +75,8 @@ time,<signal>_lower,<signal>_upper,...,status  a PNG, and a report: one HTML fil
 
 exit codes: 0 done, 1 a simulated run was not held by its boxes (monte-carlo), 2 something in the
 command, the configuration, the table or the folder is wrong (one line says what, and no file is
-written), 130 interrupted (143: by SIGTERM).
+written), 3 the files are written, but nearly every step contradicts the stated bounds (estimate: wrong
+units?), 130 interrupted (143: by SIGTERM). Conflicts now and then are results, and exit code 0.
 
 docs/command-line.md explains init, long tables, --follow, the report and --format json.
 """

@@ -30,6 +30,7 @@ class Labelled:
     def __init__(self, problem: Problem, boxes: Boxes, totals: Totals, title: str, certificate: Any):
         self._problem, self._boxes, self._totals = problem, boxes, totals
         self._title, self._certificate = title, certificate
+        self._measured = measured_states(problem.system)
 
     def parts(self) -> Iterator[Any]:
         """Some rows at a time; one dataset of all of them where they are in memory."""
@@ -81,10 +82,30 @@ class Labelled:
             title=self._title,
             certificate=self._certificate,
         )
+        for output, state in self._measured.items():
+            dataset[f"measured_{problem.output.names[output]}"].attrs["measures"] = problem.state.names[state]
         dataset.attrs["alarms"] = json.dumps(self._totals.alarms, ensure_ascii=False)
         if self._totals.alarm_count > len(self._totals.alarms):
             dataset.attrs["alarm_count"] = self._totals.alarm_count
         return dataset
+
+
+def measured_states(system: Any) -> dict[int, int]:
+    """Outputs that are a state and noise, and which state: g returns it as it is at some points, and no input enters.
+
+    Of a signal that has a name of its own, `framers` would not know.
+    """
+    import jax
+
+    rng = np.random.default_rng(0)
+    found: list[np.ndarray] = []
+    with jax.enable_x64(True):
+        for _ in range(4):
+            x, u = rng.uniform(0.1, 0.9, system.n), rng.uniform(0.1, 0.9, system.m)
+            found.append(np.asarray(system.measurement(jax.numpy.asarray(x), jax.numpy.asarray(u)))[:, None] == x)
+    same = np.logical_and.reduce(found)
+    free = ~(np.any(system.H, 1) | np.any(system.D, 1))
+    return {int(j): int(np.argmax(same[j])) for j in np.flatnonzero(same.any(1) & free)}
 
 
 def _hulls(boxes: Boxes) -> np.ndarray:

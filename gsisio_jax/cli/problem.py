@@ -27,7 +27,8 @@ class Names:
 
 @dataclass(frozen=True)
 class Problem:
-    """All that the observer needs, apart from the measurements; `arguments` are those that the system was made with."""
+    """All that the observer needs, apart from the measurements; `arguments` are those that the system was made with,
+    `around` is where region = "auto" looks."""
 
     system: Any
     noise: Any
@@ -40,6 +41,7 @@ class Problem:
     output: Names
     known_input: Names
     arguments: dict[str, Any] = field(default_factory=dict)
+    around: Any = None
 
 
 @contextlib.contextmanager
@@ -121,6 +123,13 @@ def build_problem(config: Config, file: str) -> Problem:
         region: Any = "auto"
     else:
         region = box("region", Bounds(lower=config.region.lower, upper=config.region.upper), "states")
+    around = config.region.around
+    if around == "initial":
+        around = box("initial", config.initial, "states")
+    elif isinstance(around, Bounds):
+        around = box("region.around", around, "states")
+    elif around is not None:
+        check("region.around", around, "states")
     groups = {
         "state": names("state", config.signals.state, "states", "x"),
         "input": names("input", config.signals.input, "inputs", "d"),
@@ -135,6 +144,7 @@ def build_problem(config: Config, file: str) -> Problem:
         u_region=None if config.u_region is None else box("u_region", config.u_region, "known inputs"),
         initial=box("initial", config.initial, "states"),
         design=config.design.model_dump(exclude_none=True),
+        around=around,
         arguments=config.system.arguments,
         **groups,
     )

@@ -9,6 +9,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from ..observer.summary import Outside, units_hint
 from .problem import Problem
 from .run import Outcome
 from .totals import Signal, Totals
@@ -44,8 +45,10 @@ def summarise(
         *notes,
         ("missing rows", f"{totals.absent}{partly}"),
         ("conflicts", _conflicts(totals.alarm_times)),
+        *([("units?", doubt(totals))] if doubt(totals) else []),
         ("unbounded", f"{totals.statuses['UNBOUNDED']} steps with a state that is not bounded"),
         *([("delay", _delay(outcome.boxes.delay))] if outcome.boxes.delay else []),
+        ("outside", str(outside(totals, outcome))),
         *([("resumed", f"after step {outcome.resumed:,}")] if outcome.resumed else []),
         ("design", f"{outcome.design_seconds:.2f} s"),
         ("compile", f"{outcome.compile_seconds:.2f} s"),
@@ -61,7 +64,7 @@ def summarise(
         header=("signal", "mean width", "last width", "unbounded steps", "certified width", "room in region"),
         signals=_signals(totals, certificate),
         alarms=alarms,
-        certificate=certificate_lines(certificate, problem),
+        certificate=certificate_lines(certificate, problem, outside(totals, outcome)),
         files=[str(path) for path in files],
     )
 
@@ -75,8 +78,18 @@ def alarm_line(record: dict[str, Any]) -> str:
     return f"{seconds(record['time'])} s: {record['text']}"
 
 
-def certificate_lines(certificate: Any, problem: Problem) -> list[str]:
-    """The certificate in short: what is promised, or why nothing is."""
+def doubt(totals: Totals) -> str:
+    """What is to be said of a run whose data contradict the bounds at nearly every step; "" of others."""
+    return units_hint(totals.alarm_count, totals.steps - totals.absent)
+
+
+def outside(totals: Totals, outcome: Outcome) -> Outside:
+    """Steps for which no width is promised, because of where they are."""
+    return Outside(totals.steps, totals.statuses["OUTSIDE_REGION"], totals.beyond, outcome.u_outside)
+
+
+def certificate_lines(certificate: Any, problem: Problem, found: Outside | None = None) -> list[str]:
+    """The certificate in short: what is promised, or why nothing is, and where a run was outside of it."""
     if not certificate.certified:
         lines = ["none: no bound on the widths is promised (the boxes are guaranteed all the same)"]
     elif not certificate.self_consistent:
@@ -86,6 +99,8 @@ def certificate_lines(certificate: Any, problem: Problem) -> list[str]:
         lines = ["holds anywhere: while no measurement is missing, widths settle at or below the certified ones"]
     else:
         lines = ["holds: as long as the boxes stay in the region, widths settle at or below the certified ones"]
+    if found is not None and found.outside and certificate.self_consistent:
+        lines = [found.of_promise(), f"where it applies: {lines[0].partition(': ')[2]}"]
     if certificate.recoverable is False:
         lines.append("after a lost row the boxes may stay unbounded")
     return lines + [str(note) for note in certificate.notes]
@@ -116,7 +131,9 @@ def _signals(totals: Totals, certificate: Any) -> list[Row]:
 
 def promised(totals: Totals, certificate: Any) -> Iterator[tuple[Signal, float | None, float | None]]:
     """Every signal with its certified width and its room in the region; None where nothing is promised."""
-    states = zip(np.asarray(certificate.steady_width), np.asarray(certificate.slack), strict=True)
+    # Where f and g are affine there is no region to leave.
+    rooms = np.asarray(certificate.slack) if certificate.region_matters else [None] * len(certificate.steady_width)
+    states = zip(np.asarray(certificate.steady_width), rooms, strict=True)
     inputs = ((width, None) for width in np.asarray(certificate.input_width))
     for signal, (width, room) in zip(totals.signals, (*states, *inputs), strict=True):
         yield (signal, float(width), room) if certificate.certified else (signal, None, None)

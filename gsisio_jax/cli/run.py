@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from ..observer.estimation import OnConflict
+from ..observer.summary import beyond
 from .boxes import Boxes, record_type
 from .checkpoint import Checkpoint, Digest, identity, refused
 from .logs import Table
@@ -22,7 +23,8 @@ CHUNK = 1024
 
 @dataclass(frozen=True)
 class Outcome:
-    """The boxes and what they took, in seconds; `resumed` steps were there from an interrupted run."""
+    """The boxes and what they took, in seconds; `resumed` steps were there from an interrupted run, and at `u_outside`
+    steps the known input was not inside of `u_region`."""
 
     observer: Any
     boxes: Boxes
@@ -30,15 +32,18 @@ class Outcome:
     compile_seconds: float
     run_seconds: float
     resumed: int = 0
+    u_outside: int = 0
 
 
-def design(problem: Problem) -> Any:
-    """Design the observer of a problem."""
+def design(problem: Problem, progress: bool | None = None) -> Any:
+    """Design the observer of a problem; `progress` as in `design_observer`, False where a bar is shown already."""
     import gsisio_jax as gx
 
-    options = dict(problem.design)
+    options = {**problem.design, "progress": progress}
     if problem.u_region is not None:
         options["u_region"] = problem.u_region
+    if problem.around is not None:
+        options["around"] = problem.around
     return gx.design_observer(problem.system, problem.noise, problem.region, **options)
 
 
@@ -73,7 +78,7 @@ def run(
     clock = time.perf_counter
     progress.stage("designing")
     began = clock()
-    observer = design(problem)
+    observer = design(problem, progress=False)
     design_seconds = clock() - began
     system = problem.system
     delay = getattr(observer, "delay", 0)
@@ -94,7 +99,7 @@ def run(
         boxes.close()
         raise
     seconds = clock() - began - runner.compile_seconds
-    return Outcome(observer, boxes, design_seconds, runner.compile_seconds, seconds, runner.resumed)
+    return Outcome(observer, boxes, design_seconds, runner.compile_seconds, seconds, runner.resumed, runner.u_outside)
 
 
 class _Runner:
@@ -114,7 +119,7 @@ class _Runner:
         self.boxes, self.checkpoint, self.digest = boxes, checkpoint, Digest()
         self.carry: Any = None
         self.compile_seconds = 0.0
-        self.resumed, self._stored, self._read, self._full = 0, "", 0, False
+        self.resumed, self._stored, self._read, self._full, self.u_outside = 0, "", 0, False, 0
         self.identity = identity(observer, problem, on_conflict, chunk) if checkpoint is not None else ""
 
     def begin(self, row: Table, resume: bool) -> None:
@@ -167,17 +172,22 @@ class _Runner:
 
     def _count(self, part: Table) -> None:
         self.digest.add(part.time, part.y, part.u)
-        self._read += len(part.time)
+        self._seen(part)
         if self._read >= self.resumed and (self._read > self.resumed or str(self.digest) != self._stored):
             raise refused(self.resumed)
 
     def _keep(self, part: Table, out: Any) -> None:
         self.boxes.append(part.time, part.y, out)
-        self._read += len(part.time)
+        self._seen(part)
         if self.checkpoint is not None:
             self.digest.add(part.time, part.y, part.u)
             if self.checkpoint.due(self.boxes):
                 self._save(self.checkpoint)
+
+    def _seen(self, part: Table) -> None:
+        self._read += len(part.time)
+        if part.u is not None:
+            self.u_outside += int(np.count_nonzero(beyond(part.u, part.u, self.observer.u_region)))
 
     def _save(self, checkpoint: Checkpoint) -> None:
         checkpoint.save(self.boxes, self.carry, self.identity, self.digest)

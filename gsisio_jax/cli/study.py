@@ -112,7 +112,7 @@ def _study(options: Namespace, path: Path, config: Config, kind: str, plan: Call
                 shared = _shared(config, part, problem, title, f"{path.name}: {kind}")
                 progress.stage("designing")
                 began = time.perf_counter()
-                observer = design(problem)
+                observer = design(problem, progress=False)
                 design_seconds = time.perf_counter() - began
             with begun_anew(store, options.fresh):
                 before = finished(store)

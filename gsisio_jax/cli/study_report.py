@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..observer.status import Status
+from ..observer.summary import units_hint
 from ..plot.scales import quantiles
 from ..plot.study import with_entry
 from .problem import Names, Problem
@@ -63,6 +64,7 @@ def _facts(dataset: Any, effort: Effort) -> list[tuple[str, ...]]:
     product = " x ".join(f"{size} {dim.replace('_', ' ')}" + "s" * (size > 1) for dim, size in sizes.items())
     unbounded = int((status.values.astype(np.int64) & int(Status.UNBOUNDED) != 0).sum())
     conflicts = dataset["conflicts"].values
+    outside = int((status.values.astype(np.int64) & int(Status.OUTSIDE_REGION) != 0).sum())
     rate = effort.computed * effort.steps / max(effort.seconds, 1e-9)
     kept = f", {effort.kept} of them from an earlier run" if effort.kept else ""
     speed = f", {rate:,.0f} box-steps/s, compiling included" if effort.computed else ""
@@ -75,6 +77,10 @@ def _facts(dataset: Any, effort: Effort) -> list[tuple[str, ...]]:
         ("bounded", f"{_percent(1 - unbounded / cases)} of the cases at every step"),
         ("conflicts", f"{int(conflicts.sum()):,} steps in {int((conflicts > 0).sum()):,} cases"),
     ]
+    if hint := units_hint(int((conflicts > 0).sum()), cases):
+        facts.append(("units?", hint))
+    if outside:
+        facts.append(("outside", f"{outside:,} cases leave the region at some step: no width is promised there"))
     if "missed" in dataset.attrs:
         facts.append(("misses", dataset.attrs["missed"]))
     return facts
@@ -116,7 +122,11 @@ def _signals(problem: Problem, certificate: Any, dataset: Any) -> tuple[tuple[st
                 widths = widths[~np.isnan(widths)]
                 width = float(promised[kind].isel({dim: i for dim, i in at.items() if dim in promised[kind].dims}))
                 infinite = np.isinf(widths).mean() if len(widths) else 0.0
-                room = short(region[index] - width) if kind == "state" and np.isfinite(width) else ""
+                room = (
+                    short(region[index] - width)
+                    if kind == "state" and certificate.region_matters and np.isfinite(width)
+                    else ""
+                )
                 label = f"{name} [{unit}]" if unit else name
                 rows.append(
                     (

@@ -12,6 +12,7 @@ import numpy as np
 from ..dataset import alarm_records
 from ..observer.alarms import read_alarms
 from ..observer.status import Status
+from ..observer.summary import beyond
 from .problem import Names, Problem
 
 MOST_ALARMS = 10_000  # with their words; status and margin of the files have all
@@ -54,6 +55,7 @@ class Totals:
     Attributes:
         absent, partly: rows without any measurement, and with some entries missing.
         statuses: steps by the bit of their status.
+        beyond: steps whose state box is not inside the region.
         alarms: the first `MOST_ALARMS` as plain data; `alarm_times` has the times of all, `alarm_count` of them.
     """
 
@@ -64,6 +66,7 @@ class Totals:
     absent: int = 0
     partly: int = 0
     statuses: dict[str, int] = field(default_factory=dict)
+    beyond: int = 0
     alarms: list[dict[str, Any]] = field(default_factory=list)
     alarm_times: np.ndarray = field(default_factory=lambda: np.empty(0))
 
@@ -72,14 +75,15 @@ class Totals:
         return len(self.alarm_times)
 
 
-def gather(parts: Iterable[np.ndarray], problem: Problem, output_rows: Sequence[tuple[int, ...]]) -> Totals:
+def gather(parts: Iterable[np.ndarray], problem: Problem, observer: Any) -> Totals:
     """Count over the parts of `Boxes`.
 
     Args:
         parts: rows in order.
         problem: names and units.
-        output_rows: of the observer, which outputs a row of T2 combines.
+        observer: of the run.
     """
+    region, output_rows = observer.certificate.region, observer.output_rows
     totals = Totals([*_signals(problem.state, "state"), *_signals(problem.input, "input")])
     members = [member for member in Status if member.value]
     totals.statuses = {str(member.name): 0 for member in members}
@@ -94,6 +98,7 @@ def gather(parts: Iterable[np.ndarray], problem: Problem, output_rows: Sequence[
         totals.partly += int((missing.any(axis=1) & ~whole).sum())
         for member in members:
             totals.statuses[str(member.name)] += int(np.count_nonzero(rows["status"] & int(member)))
+        totals.beyond += int(np.count_nonzero(beyond(rows["state_lower"], rows["state_upper"], region)))
         width = np.concatenate([rows[f"{kind}_upper"] - rows[f"{kind}_lower"] for kind in ("state", "input")], axis=1)
         for index, signal in enumerate(totals.signals):
             signal.add(width[:, index])

@@ -24,6 +24,7 @@ def checked(
     window: int | str,
     missing: Any,
     certify: Any,
+    progress: Any,
 ) -> tuple[Interval | None, Interval]:
     """The region (None: it is to be looked for) and the box of known inputs.
 
@@ -38,6 +39,8 @@ def checked(
     for name, count in (("gains", gains), ("sweeps", sweeps)):
         if isinstance(count, bool) or not isinstance(count, int | np.integer):
             raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1, got {count!r}")
+    if progress is not None and not isinstance(progress, bool | np.bool_):
+        raise ValueError(f"design_observer: `progress` must be True, False or None, got {progress!r}")
     for name, flag in (("missing", missing), ("certify", certify)):
         if not isinstance(flag, bool | np.bool_):
             raise ValueError(f"design_observer: `{name}` must be True or False, got {flag!r}")

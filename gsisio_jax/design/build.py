@@ -24,11 +24,14 @@ from gsisio_jax.design.gain_selection import (
     units,
 )
 from gsisio_jax.design.gains import optimal_gain
+from gsisio_jax.design.gains_with_less import gains_with_less
+from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
 from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
+from gsisio_jax.design.progress import Say, told
 from gsisio_jax.design.recovery import with_recovery
-from gsisio_jax.design.region import find_region
+from gsisio_jax.design.region import Around, find_region, grown_around, read_around
 from gsisio_jax.design.slices import check_split, with_slices
 from gsisio_jax.design.tolerant import Guessed, check_tolerate, tolerant
 from gsisio_jax.design.undefined import undefined_in
@@ -66,6 +69,8 @@ def design_observer(
     cells: int = 1,
     split: int | Literal["auto"] = 1,
     tolerate: Literal[0] = 0,
+    around: Around | None = None,
+    progress: bool | None = None,
 ) -> Observer: ...
 
 
@@ -106,6 +111,8 @@ def design_observer(
     delay: int | Literal["auto"],
     cells: int = 1,
     split: int | Literal["auto"] = 1,
+    around: Around | None = None,
+    progress: bool | None = None,
 ) -> Observer | DelayedObserver: ...
 
 
@@ -121,6 +128,8 @@ def design_observer(
     left_inverse: LeftInverse | Any = "pseudo",
     allow_uncertified: bool = False,
     derivative: Interval | None = None,
+    around: Around | None = None,
+    progress: bool | None = None,
 ) -> PredictionObserver: ...
 
 
@@ -143,6 +152,8 @@ def design_observer(
     cells: int = 1,
     split: int | Literal["auto"] = 1,
     tolerate: int = 0,
+    around: Around | None = None,
+    progress: bool | None = None,
 ) -> Observer | PredictionObserver | DelayedObserver | TolerantObserver:
     """Design the gains of an interval observer offline, and certify the width of its boxes.
 
@@ -151,7 +162,7 @@ def design_observer(
         noise: constant bounds of w and v.
         region: convex box (n,) of states for which the gain is optimised and on which the width promise holds. It does
             not limit the observer: boxes are certain anywhere. Infinite sides are legal where f and g are affine or
-            have bounded slopes. "auto" looks for a region that fits its own steady width.
+            have bounded slopes. "auto" looks for a region that has room for its own steady width, see `around`.
         form: "current" uses y[k] for the box of x[k]; "prediction" is the paper's recursion, from y[0..k-1] alone, and
             takes none of `gains`, `missing` and `sweeps`.
         gains: size of the bank: the certified gain, and ``gains - 1`` more that are best for larger boxes.
@@ -189,6 +200,12 @@ def design_observer(
         tolerate: q: boxes are certain even if up to q outputs of any one step are wrong, whichever these are. Outputs
             are voted out: `Estimate.kept` says which agree. The result is a `TolerantObserver`; a step is as many
             steps as there are choices of q wrong outputs in this and in the last measurement.
+        around: where region="auto" looks: a state (n,), a box (an `Interval` (n,), the initial one say), or a
+            trajectory: states (T, n) or boxes over time, as of a simulation or an earlier estimate. The region holds
+            all of it and the steady boxes there. None: the centre of the state bounds (0 where there are none); a run
+            elsewhere leaves such a region, which the certificate notes, and ``est.summary()`` counts.
+        progress: say on standard error what the design is at, once it has taken two seconds. None: where that is a
+            terminal.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
@@ -205,44 +222,75 @@ def design_observer(
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
     check_cells(cells, form)
-    votes = check_tolerate(tolerate, system, form, missing, window, delay)
-    given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify)
+    check_tolerate(tolerate, system, form, missing, window, delay)
+    given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify, progress)
     check_split(split, form)
-    if check_delay(delay, system, form):
-
-        def inner(plant: System, noise: Noise, quick: bool) -> Observer:
-            return design_observer(
-                plant, noise, region, gains=1 if quick else gains, u_region=u_region, missing=missing and not quick,
-                sweeps=sweeps, bounds=bounds, certify=certify and not quick, window=1 if quick else window, delay=0,
-                cells=1 if quick else cells,
-                split=1 if quick else split,
-            )  # fmt: skip
-
-        return design_delayed(inner, system, noise, given, u_region, delay)
+    near = read_around(system, around, given is None)
+    late = check_delay(delay, system, form)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS
     methods = check_methods("design_observer", default if bounds is None else bounds)
-    if form == "prediction":
-        return design_prediction(system, noise, given, u_region, methods, left_inverse, allow_uncertified, derivative)
+    with told("design_observer", progress) as say:
+        if form == "prediction":
+            return design_prediction(
+                system, noise, given, u_region, methods, left_inverse, allow_uncertified, derivative, near
+            )
+
+        def design(plant: System, noise: Noise, quick: bool) -> Observer:
+            return _design(
+                plant, noise, given, near, 1 if quick else gains, u_region, missing and not quick, sweeps, methods,
+                certify and not quick, 1 if quick else window, 1 if quick else cells, 1 if quick else split,
+                tolerate, say,
+            )  # fmt: skip
+
+        return design_delayed(design, system, noise, given, u_region, delay) if late else design(system, noise, False)
+
+
+def _design(
+    system: System,
+    noise: Noise,
+    given: Interval | None,
+    near: Interval | None,
+    gains: int,
+    u_region: Interval,
+    missing: bool,
+    sweeps: int,
+    methods: tuple[str, ...],
+    certify: bool,
+    window: int | Literal["auto"],
+    cells: int,
+    split: int | Literal["auto"],
+    tolerate: int,
+    say: Say,
+) -> Any:
+    """The current form, its arguments checked; `given` is the region, or None and it is looked for around `near`."""
+    say("bounding slopes")
     feedthrough = factorise(np.asarray(system.H))
     slopes_on = slopes_of(system, feedthrough.T2, u_region)
     everywhere = slopes_on(system.state_bounds)
     try:
         check_existence(system, feedthrough, everywhere)
     except ObserverDoesNotExist as error:
-        raise with_delay(error, system, u_region) from None
+        say("looking for what would help")
+        reason = with_delay(error, system, u_region)
+        ways = what_helps(Plan(system, noise, feedthrough, u_region), slopes_on, near if given is None else given)
+        raise type(reason)(f"{reason}{ways}") from None
     plan = Plan(system, noise, feedthrough, u_region)
-    box = _found_region(plan, slopes_on, certify) if given is None else given
+    say("looking for a region")
+    box = _found_region(plan, slopes_on, certify, near) if given is None else given
+    say("choosing gains")
     first = first_gain(plan, slopes_on, box, certify)
     problem, main = first.problem, first.gain
     bank = [main, *profile_bank(problem, main, box, gains - 1)]
     if missing or system.periodic:  # the multiple of a periodic output is chosen without that output
         bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
-    guessed = Guessed(problem, main, box, feedthrough, tolerate) if votes else None
+    guessed = Guessed(problem, main, box, feedthrough, tolerate) if tolerate else None
     if guessed is not None:
         bank.extend(guessed.gains())
     bank = distinct([*bank, *gains_without_state_bounds(problem, main, box)])
+    bank = distinct([*bank, *gains_with_less(problem, bank, box)])
     steady = problem.steady_width(bank[0])
     width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
+    say("bounding unknown inputs")
     outputs, slack = first_form(system, feedthrough.T2, u_region)
     observer = assemble(plan, problem, box, bank, input_bounds(problem, width), everywhere.affine, methods, sweeps)
     if first.uncertified:
@@ -251,17 +299,22 @@ def design_observer(
         weights = np.asarray(observer.gains.residual[0])
         certificate = with_slices(observer.certificate, noise, weights, slopes_on, box, split)
         observer = replace(observer, certificate=certificate)
-    if not everywhere.affine and (why := undefined_in(system, box, u_region)):
-        certificate = observer.certificate
-        observer = replace(observer, certificate=replace(certificate, notes=(*certificate.notes, why)))
     observer = replace(observer, cells=counts(cells, everywhere.bent_outputs))
+    if not (first.uncertified or observer.certificate.certified):
+        way = what_settles(plan, slopes_on, box)
+        observer = replace(observer, certificate=observer.certificate.with_notes(way))
+    if not everywhere.affine:
+        found = (undefined_in(system, box, u_region), grown_around(near, box) if given is None else "")
+        observer = replace(observer, certificate=observer.certificate.with_notes(*found))
     if window != 1:
+        say("choosing rows over several steps")
         rows = window_rows(problem, window, width)
         observer = replace(observer, window=rows)
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
     maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
+    say("bounding what rounding leaves")
     if maps is not None:
         rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
         observer = replace(observer, recovery=rows_alone)
@@ -270,21 +323,32 @@ def design_observer(
         observer, system, first.slopes, everywhere, outputs, slack, maps, np.float64, slices
     )  # fmt: skip
     if certify:
-        check_initial_contraction(problem, bank[0], observer, outputs)
-    if votes:
+        try:
+            check_initial_contraction(problem, bank[0], observer, outputs)
+        except NoDesignFound as error:
+            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, box)}") from None
+    if tolerate:
         return tolerant(observer, tolerate)
     if not missing:
         return observer
-    return replace(observer, certificate=with_recovery(observer, width, u_region))
+    say("trying what happens after a lost row")
+    certificate = with_recovery(observer, width, u_region)
+    if certificate.recoverable is False:
+        certificate = certificate.with_notes(what_recovers(plan, slopes_on, box))
+    return replace(observer, certificate=certificate)
 
 
-def _found_region(plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool) -> Interval:
+def _found_region(
+    plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool, near: Interval | None
+) -> Interval:
     """region="auto"; where there is none and no certificate is asked for, the point that the search began at."""
     try:
-        return find_region(plan.system, lambda box: _steady_width(plan, box, slopes_on(box)))
-    except NoDesignFound:
+        return find_region(plan.system, lambda box: _steady_width(plan, box, slopes_on(box)), near)
+    except NoDesignFound as error:
         if certify:
-            raise
+            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, near)}") from None
+        if near is not None:
+            return near
         center = np.asarray(plan.system.state_bounds.center, np.float64)
         return Interval(center, center)
 

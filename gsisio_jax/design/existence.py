@@ -60,8 +60,8 @@ def check_rank(problem: GainProblem) -> None:
     raise NoDesignFound(
         f"design_observer: with the slopes at the centre of the region, the unknown input direction "
         f"d = {_show(direction)} (free inputs only) does not show in [H; C G], so no gain cancels it. "
-        f"{problem.how_inputs_show()} It may be visible elsewhere: choose a region around another point, or a smaller "
-        "one; or give `state_bounds` or `input_bounds`, or more outputs."
+        f"{problem.how_inputs_show()} It may be visible elsewhere: choose a region around another point; or give "
+        "`state_bounds` or `input_bounds`, or more outputs."
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.existence import check_rank
 from gsisio_jax.design.gain_selection import main_gain
+from gsisio_jax.design.guidance import starts, what_helps
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.inclusion.culprits import Culprit, culprits
@@ -74,7 +75,8 @@ def first_gain(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Inte
     except NoDesignFound as error:
         if certify:
             hint = " certify=False gives an observer without a certificate."
-            raise NoDesignFound(f"{error}{hint}{_scaled(plan, slopes_on, region)}") from None
+            hint += _scaled(plan, slopes_on, region) + what_helps(plan, slopes_on, region)
+            raise NoDesignFound(f"{error}{hint}") from None
         gain, uncertified = _any_gain(problem), f"no width is promised: {error}"
     return FirstGain(problem, slopes, gain, uncertified)
 
@@ -124,7 +126,8 @@ def _any_gain(problem: GainProblem) -> np.ndarray:
 
 
 def _scaled(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> str:
-    """The largest multiple of the region about its centre for which a gain exists, as a hint; "" where none is met."""
+    """The largest multiple of the region about its centre for which a gain exists, as a hint, or that there
+    is none; "" where the region is unbounded or a point."""
     lower, upper = (np.asarray(side, np.float64) for side in (region.lower, region.upper))
     if not (np.isfinite(lower) & np.isfinite(upper)).all() or not (upper > lower).any():
         return ""
@@ -132,6 +135,8 @@ def _scaled(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interva
 
     def of(scale: float) -> Interval:
         return Interval(center - scale * radius, center + scale * radius)
+
+    everywhere = slopes_on(plan.system.state_bounds)
 
     def works(scale: float, contracts: bool) -> bool:
         slopes = slopes_on(of(scale))
@@ -142,6 +147,8 @@ def _scaled(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interva
             check_rank(problem)
             gain = main_gain(problem, of(scale))
         except NoDesignFound:
+            return False
+        if not starts(plan, problem, gain, slopes, everywhere):
             return False
         return not contracts or bool(np.isfinite(problem.steady_width(gain)).all())
 
@@ -158,4 +165,4 @@ def _scaled(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interva
             f" Scaled by {low:.3g} about its centre ({sides}), the region has a gain"
             f"{', and widths settle' if contracts else ', though no widths that settle'}."
         )
-    return ""
+    return " A smaller region about the same centre alone does not help."

@@ -17,18 +17,27 @@ from gsisio_jax.observer.certificate import spectral_radius
 _MOST_OUTPUTS_FOR_ALL_PATTERNS = 4  # 2^4 patterns of missing entries get a gain each; beyond, one entry at a time
 
 
-def main_gain(problem: GainProblem, region: Interval) -> np.ndarray:
-    """The certified gain if there is one; else the gain that keeps boxes of a typical width smallest."""
+def main_gain(problem: GainProblem, region: Interval, usable: np.ndarray | None = None) -> np.ndarray:
+    """The certified gain if there is one; else the gain that keeps boxes of a typical width smallest.
+
+    Args:
+        problem: the gain problem.
+        region: of the design.
+        usable: as in `profile_gain`; None: all.
+
+    Raises:
+        NoDesignFound: there is none whose boxes would be finite.
+    """
     scale = typical_width(problem, region)
-    gain = optimal_gain(problem, np.ones(problem.n), scale)
+    everything = np.full(problem.columns, True) if usable is None else usable.copy()
+    gain = optimal_gain(problem, np.ones(problem.n), scale, everything)
     if gain is not None and np.isfinite(problem.steady_width(gain)).all():
         # Solve once more in units of the answer: states of very different size are then equally accurate.
-        again = optimal_gain(problem, np.ones(problem.n), units(problem.steady_width(gain)))
+        again = optimal_gain(problem, np.ones(problem.n), units(problem.steady_width(gain)), everything)
         if again is not None and (problem.steady_width(again) <= problem.steady_width(gain)).all():
             gain = again
-        return improve(problem, gain)
+        return improve(problem, gain, usable=everything)
     # No gain contracts. Widths of the cheapest gains over a few steps are the profile to be good at.
-    everything = np.full(problem.columns, True)
     width, gain = scale, None
     for _ in range(3):
         gain = profile_gain(problem, width, everything, units(width))
@@ -49,7 +58,7 @@ def main_gain(problem: GainProblem, region: Interval) -> np.ndarray:
         raise NoDesignFound(
             "design_observer: on this region the output is too nonlinear for the gain: rho(|N_z| R) = "
             f"{spectral_radius(problem.implicit(gain)):.3g} >= 1, so the box of x[k] would not be finite. "
-            f"{problem.how_inputs_show()} What may help: a smaller region, `state_bounds`, or more outputs."
+            f"{problem.how_inputs_show()} What may help: `state_bounds`, or more outputs."
         )
     return plain
 

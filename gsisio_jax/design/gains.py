@@ -25,7 +25,9 @@ _SOLVER: dict[str, Any] = {
 }
 
 
-def optimal_gain(problem: GainProblem, weight: np.ndarray, scale: np.ndarray) -> np.ndarray | None:
+def optimal_gain(
+    problem: GainProblem, weight: np.ndarray, scale: np.ndarray, usable: np.ndarray | None = None
+) -> np.ndarray | None:
     """The gain whose steady width is componentwise smallest among all gains, or None if no gain contracts.
 
     With a weight lambda per state and Y = diag(lambda) N everything is linear (theory 4):
@@ -36,17 +38,19 @@ def optimal_gain(problem: GainProblem, weight: np.ndarray, scale: np.ndarray) ->
         problem: the gain problem.
         weight: the vector c > 0 (n,); the optimal gain does not depend on it.
         scale: expected widths (n,), the units in which the program is solved.
+        usable: as in `profile_gain`; None: all.
     """
+    usable = np.full(problem.columns, True) if usable is None else usable
     inner = problem.scaled(scale)
     program = LinearProgram()
     lam, Y = program.variable(inner.n), program.variable(inner.n, inner.columns)
-    growth, noise = _rows(program, inner, diagonal(lam), Y, np.full(inner.columns, True))
+    growth, noise = _rows(program, inner, diagonal(lam), Y, usable)
     program.nonnegative(lam)
     program.nonnegative(lam - growth.sum(axis=0) - weight)
     found = program.minimise(noise.sum(), lam, Y)
     if found is None or found[0].min() <= 0:
         return None
-    return _finish(problem, inner, found[1] / found[0][:, None], scale, np.full(inner.columns, True))
+    return _finish(problem, inner, found[1] / found[0][:, None], scale, usable)
 
 
 def profile_gain(problem: GainProblem, width: np.ndarray, usable: np.ndarray, scale: np.ndarray) -> np.ndarray | None:
@@ -72,12 +76,12 @@ def profile_gain(problem: GainProblem, width: np.ndarray, usable: np.ndarray, sc
     return None if found is None else _finish(problem, inner, found[0], scale, usable)
 
 
-def improve(problem: GainProblem, N: np.ndarray, rounds: int = 4) -> np.ndarray:
+def improve(problem: GainProblem, N: np.ndarray, rounds: int = 4, usable: np.ndarray | None = None) -> np.ndarray:
     """Policy iteration: replace rows by better ones at the current steady width until nothing changes.
 
     The linear program already is at the optimum up to the solver's tolerance; this takes it to rounding.
     """
-    everything = np.full(problem.columns, True)
+    everything = np.full(problem.columns, True) if usable is None else usable
     for _ in range(rounds):
         width = problem.steady_width(N)
         if not np.isfinite(width).all():

@@ -25,8 +25,8 @@ from gsisio_jax.plant.system import System
 _ROUNDS = 3  # widths without the same outputs in every step, from one step to the next
 
 
-def check_tolerate(tolerate: Any, system: System, form: str, missing: bool, window: Any, delay: Any) -> bool:
-    """Are wrong outputs to be tolerated?
+def check_tolerate(tolerate: Any, system: System, form: str, missing: bool, window: Any, delay: Any) -> None:
+    """Refuses wrong outputs that cannot be tolerated.
 
     Raises:
         ValueError: it is no whole number, leaves no output, takes too many guesses, or goes with nothing.
@@ -35,7 +35,7 @@ def check_tolerate(tolerate: Any, system: System, form: str, missing: bool, wind
     if not whole or tolerate < 0:
         raise ValueError(f"design_observer: `tolerate` must be a whole number of outputs, at least 0, got {tolerate!r}")
     if tolerate == 0:
-        return False
+        return
     if tolerate >= l:
         raise ValueError(
             f"design_observer: `tolerate` must be below the number of outputs, {l}, got {tolerate}: nothing would be "
@@ -60,7 +60,6 @@ def check_tolerate(tolerate: Any, system: System, form: str, missing: bool, wind
             "design_observer: with `tolerate`, no output or state may be periodic; unwrap the outputs (numpy.unwrap), "
             "and leave the periods out"
         )
-    return True
 
 
 class Guessed:

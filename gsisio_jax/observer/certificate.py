@@ -109,6 +109,10 @@ class Certificate(eqx.Module):
         )}  # fmt: skip
         return replace(self, **infinite, promised=False, slices=None, notes=(*self.notes, why))
 
+    def with_notes(self, *notes: str | None) -> Certificate:
+        """The same with more notes; those that are empty are left out."""
+        return replace(self, notes=(*self.notes, *filter(None, notes)))
+
     def noise_width(self, noise: Noise) -> Any:
         """What one step adds to the width, b of theory 4.1, (n,) or (T, n)."""
         check_type("Certificate", "noise", noise, Noise, "gx.Noise(w, v)")

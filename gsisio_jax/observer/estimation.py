@@ -18,6 +18,7 @@ from gsisio_jax.observer.checks import AnyObserver, check_length, check_on_confl
 from gsisio_jax.observer.delayed import DelayedObserver, to_the_end
 from gsisio_jax.observer.fixed import Fixed, chosen, fixed
 from gsisio_jax.observer.scan import advance, begin, blank, cut, once, scan
+from gsisio_jax.observer.summary import summary
 from gsisio_jax.observer.types import Carry, StepOutput, cast
 from gsisio_jax.plant.system import Noise
 
@@ -64,6 +65,16 @@ class Estimate(eqx.Module):
             ValueError: the estimate is batched; take one record first.
         """
         return read_alarms(self.status, self.margin, self.source, self.output_rows)
+
+    def summary(self, observer: AnyObserver | None = None, u: Any = None) -> str:
+        """A few lines: steps, conflicts, missing and unbounded ones, and those for which no width is promised, because
+        a box (or u) was outside of the region; of a batch, over all of it.
+
+        Args:
+            observer: that of the run; then what its certificate is worth here is said, too.
+            u: known inputs (T, m) of the run; then those outside of `u_region` are counted.
+        """
+        return summary(self, observer, u)
 
     def to_xarray(self, **labels: Any) -> Any:
         """The boxes as an ``xarray.Dataset`` over time, with names and units: `gsisio_jax.dataset.to_dataset`.

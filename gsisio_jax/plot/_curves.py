@@ -9,7 +9,7 @@ import numpy as np
 
 from gsisio_jax.plot import style
 from gsisio_jax.plot.scales import Merge, Scale, merge_of, quantiles
-from gsisio_jax.plot.study import BESIDE, Quantity, axes_of, prepared, quantities, title_of, with_entry
+from gsisio_jax.plot.study import BESIDE, Quantity, axes_of, conflicts_of, prepared, quantities, title_of, with_entry
 
 SINGLE = 5  # most cases that are drawn one by one
 
@@ -26,8 +26,9 @@ def curves(
     Up to five cases of the other axes are drawn one by one; of more, the median, the band from 5 to 95 % of them, and
     the worst one. Of the summary of a Monte Carlo study, the mean with its confidence interval, and the largest. Dashed
     is the steady width that the certificate promises; where it differs between the cases, its smallest and largest.
-    Triangles at the upper edge are elements with an infinite value. Scales are logarithmic where the numbers call for
-    it.
+    Triangles at the upper edge are elements with an infinite value. Red crosses are cases with conflicts (data that
+    contradict the stated bounds), and a case with some is drawn dash-dotted. Scales are logarithmic where the numbers
+    call for it.
 
     Args:
         dataset: of `sweep` or `monte_carlo`.
@@ -79,10 +80,12 @@ def _panel(axis: Any, dataset: Any, one: Quantity, scale: Scale) -> None:
     axis.set_ylabel(style.caption(style.with_unit(one.text, one.unit)))
     axis.grid(alpha=0.25)
     axis.margins(x=0.02 if scale.words is None else 0.1)
+    found = None if one.variable == "conflicts" else conflicts_of(dataset, one.values)
+    bad = None if found is None else _table(found, rest, scale) > 0
     if count > SINGLE:
-        drawn = _many(axis, scale, _table(one.values, rest, scale), merge_of(one.variable, one.flags))
+        drawn = _many(axis, scale, _table(one.values, rest, scale), merge_of(one.variable, one.flags), bad)
     else:
-        drawn = _few(axis, dataset, scale, one, rest)
+        drawn = _few(axis, dataset, scale, one, rest, bad)
     if one.predicted is not None:
         drawn += _certificate(axis, scale, one, rest, count)
     style.fit(axis, drawn, 5.0 if scale.log else style.LOG_SPAN, zero="coverage" not in one.variable)
@@ -99,7 +102,7 @@ def _finite(line: np.ndarray) -> np.ndarray:
     return np.where(np.isinf(line), np.nan, line)
 
 
-def _many(axis: Any, scale: Scale, values: np.ndarray, merge: Merge) -> list[np.ndarray]:
+def _many(axis: Any, scale: Scale, values: np.ndarray, merge: Merge, bad: np.ndarray | None) -> list[np.ndarray]:
     """Median, band and worst case of many cases; returns what is shown."""
     low, middle, high, worst = (_finite(line) for line in quantiles(values, (0.05, 0.5, 0.95, merge.worst)))
     color, drawn = style.CYCLE[0], [low, middle, worst]
@@ -114,10 +117,15 @@ def _many(axis: Any, scale: Scale, values: np.ndarray, merge: Merge) -> list[np.
         axis.vlines(scale.at, low, top, color=color, alpha=0.3, linewidth=7, label=names[1], zorder=2)
         axis.plot(scale.at, worst, "v", color=color, markersize=5, fillstyle="none", label=names[2], zorder=3)
     style.mark_unbounded(axis, scale.at, np.isinf(values).any(axis=0), "some infinite", style.GREY)
+    if bad is not None:
+        style.mark_conflicts(axis, scale.at, middle, bad.any(0) & ~bad.all(0), "conflicts in some cases")
+        style.mark_conflicts(axis, scale.at, middle, bad.all(0), "conflicts in all cases")
     return drawn
 
 
-def _few(axis: Any, dataset: Any, scale: Scale, one: Quantity, rest: list[str]) -> list[np.ndarray]:
+def _few(
+    axis: Any, dataset: Any, scale: Scale, one: Quantity, rest: list[str], bad: np.ndarray | None
+) -> list[np.ndarray]:
     """Every case by itself, with its statistics if it has some; returns what is shown."""
     values = _table(one.values, rest, scale)
     labels = _entries(dataset, rest)
@@ -130,7 +138,12 @@ def _few(axis: Any, dataset: Any, scale: Scale, one: Quantity, rest: list[str]) 
         named = dict(zip(statistics, np.moveaxis(values[case], -1, 0), strict=True)) if statistics else {}
         line = values[case] if not statistics else named.get("mean", values[case][..., 0])
         text = f"{'mean' if named else ''}{', ' if named and label else ''}{label}" or "measured"
-        axis.plot(scale.at, _finite(line), marks, color=color, linewidth=1.6, label=text, zorder=4)
+        (drawn_line,) = axis.plot(scale.at, _finite(line), marks, color=color, linewidth=1.6, label=text, zorder=4)
+        if bad is not None and bad[case].any():
+            if scale.words is None:
+                drawn_line.set_linestyle("-.")
+            said = "with conflicts" if case == np.flatnonzero(bad.any(1))[0] else "_"
+            style.mark_conflicts(axis, scale.at, _finite(line), bad[case], said)
         drawn.append(_finite(line))
         if {"mean_lower", "mean_upper"} <= named.keys():
             ends = [_finite(named[name]) for name in ("mean_lower", "mean_upper")]

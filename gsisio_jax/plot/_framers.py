@@ -34,6 +34,7 @@ def framers(
         dataset_or_estimate: result of `dataset.to_dataset`, of `sweep` with reduce=None, reduced to one case by
             ``.isel(...)``, or of `estimate` on one record.
         signals: names to draw, in order; all states and inputs where left out (``x1``, ``d1``, ... of an estimate).
+            Measurements that belong to no signal have panels of their own where they are named: ``measured_<output>``.
         truth: true values by signal name, shape (T,) or (T + 1,) each, (T - 1,) or (T,) for inputs.
         ax: one matplotlib axes per signal; a new figure where left out.
 
@@ -47,10 +48,11 @@ def framers(
     style.require()
     record = read_record(dataset_or_estimate)
     names = list(record.series) if signals is None else list(signals)
-    check_signals("framers", [*names, *(truth or {})], list(record.series))
+    every = record.series | record.outputs
+    check_signals("framers", [*names, *(truth or {})], list(every))
     axes, figure = style.panels("framers", len(names), ax, style.stacked)
     for axis, name in zip(axes, names, strict=True):
-        _panel(axis, record, record.series[name], None if truth is None else truth.get(name))
+        _panel(axis, record, every[name], None if truth is None else truth.get(name))
     for axis in axes:
         if style.in_last_row(axis, axes):
             axis.set_xlabel(record.time_label)
@@ -125,7 +127,8 @@ def _panel(axis: Any, record: Record, series: Series, truth: Any) -> None:
     else:
         for index, when in enumerate(record.alarms):
             axis.axvline(when, label="certified alarm" if index == 0 else None, **shown)
-    axis.set_title(series.widths or _widths(series), loc="right", fontsize="small", color="#444444")
+    if series.kind != "output":
+        axis.set_title(series.widths or _widths(series), loc="right", fontsize="small", color="#444444")
 
 
 def true_rows(call: str, name: str, truth: Any, steps: int, lead: tuple[int, ...] = ()) -> np.ndarray:

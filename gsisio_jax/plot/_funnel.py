@@ -21,9 +21,10 @@ def funnel(
     """Draw the boxes of many initial boxes or runs over time, closing in like a funnel.
 
     The light band is the hull of all boxes, the middle one goes from the 5 % quantile of the lower to the 95 % quantile
-    of the upper bounds, the dark one from median to median; thin lines are single cases, 20 at most. The bar behind the
-    last step is as long as the steady width that the certificate promises. Where the noise varies along an axis, its
-    middle level is drawn and named in the title; another one is had by ``.isel``.
+    of the upper bounds, the dark one from median to median; thin lines are single cases, 20 at most. Cases with
+    conflicts (data that contradict the stated bounds) are red and dash-dotted, crosses are the steps. The bar behind
+    the last step is as long as the steady width that the certificate promises. Where the noise varies along an axis,
+    its middle level is drawn and named in the title; another one is had by ``.isel``.
 
     Boxes are drawn relative to the truth if it is given. If it is not, and at some step they have no point in common,
     they cannot be about one truth: then each is drawn around its own middle.
@@ -91,10 +92,22 @@ def _panel(axis: Any, tubes: Tubes, tube: Tube, group: Group) -> None:
         for case in np.unique(np.linspace(0, count - 1, min(count, LINES)).astype(int)):
             for side in (low[case], high[case]):
                 axis.plot(time, side, color=style.EDGE, linewidth=0.4, alpha=0.35, zorder=3)
+    _conflicts(axis, time, low, high, group.conflicts)
     style.mark_unbounded(axis, time, unbounded, "some not bounded" if count > 1 else "not bounded", style.EDGE)
     if about:
         axis.axhline(0.0, color=style.TRUTH, linewidth=1.0, label="truth" if "truth" in about else None, zorder=5)
     _bar(axis, time, lower, upper, group.predicted)
+
+
+def _conflicts(axis: Any, time: np.ndarray, low: np.ndarray, high: np.ndarray, bad: np.ndarray | None) -> None:
+    """Cases whose data contradict the stated bounds at some step: dash-dotted in red, with crosses at these steps."""
+    if bad is None:
+        return
+    broken = np.flatnonzero(bad.any(1))
+    for place, case in enumerate(broken[:LINES]):
+        for text, side in (("conflict" if place == 0 else "_", low[case]), ("_", high[case])):
+            axis.plot(time, side, "-.", color=style.ALARM, linewidth=0.8, zorder=4.5)
+            style.mark_conflicts(axis, time, side, bad[case], text)
 
 
 def _centred(group: Group) -> tuple[np.ndarray, np.ndarray, str]:

@@ -10,12 +10,13 @@ import numpy as np
 
 from gsisio_jax.plot import style
 from gsisio_jax.plot.scales import Scale, merge_of
-from gsisio_jax.plot.study import Quantity, axes_of, prepared, quantities, title_of
+from gsisio_jax.plot.study import Quantity, axes_of, conflicts_of, prepared, quantities, title_of
 
 CELLS = 1000  # most cells along an axis
 ROUNDING = 1e-9  # relative
 COLORS = "viridis"  # even in lightness, for any colour vision and in print
 INFINITE, UNKNOWN, NEVER = ("////", "infinite: not bounded"), ("....", "no value"), ("....", "never")
+CONFLICTS = ("xx", "with conflicts: data contradict the bounds")
 BORDER = "#d55e00"
 
 
@@ -29,6 +30,7 @@ class Mesh:
     y_edges: np.ndarray
     values: np.ndarray
     above: np.ndarray  # 1 where wider than certified, 0 where not, NaN where unknown
+    conflicts: np.ndarray  # True where some case has steps whose data contradict the bounds
     remark: str
 
 
@@ -43,11 +45,12 @@ def heatmap(
 ) -> Any:
     """Draw what a study kept, over two of its axes, as colours.
 
-    Axes with numbers are drawn to scale, also where they are uneven, and logarithmic where they lie more evenly by
-    their factors; others are categories. Cells without a finite value are hatched. A line separates widths above the
-    steady width of the certificate from those below, unless it would wind through all of the panel. Cases of further
-    axes are drawn by their median, or, for coverage, misses, conflicts and largest values, by the worst of them; the
-    title says so. More than 1000 elements of an axis are joined in groups of neighbours, each drawn by its worst case.
+    Cells with conflicts (data that contradict the stated bounds) are crossed in red. Axes with numbers are drawn to
+    scale, also where they are uneven, and logarithmic where they lie more evenly by their factors; others are
+    categories. Cells without a finite value are hatched. A line separates widths above the steady width of the
+    certificate from those below, unless it would wind through all of the panel. Cases of further axes are drawn by
+    their median, or, for coverage, misses, conflicts and largest values, by the worst of them; the title says so. More
+    than 1000 elements of an axis are joined in groups of neighbours, each drawn by its worst case.
 
     Args:
         dataset: of `sweep` or `monte_carlo`.
@@ -126,6 +129,10 @@ def _mesh(dataset: Any, one: Quantity, x: str, y: str) -> Mesh:
         # Where the promise is met exactly, rounding must not draw a line.
         limit = (1 + ROUNDING) * every.transpose(y, x).values[places]
         above = np.where(np.isnan(values), np.nan, values > limit)
+    found = None if one.variable == "conflicts" or one.flags else conflicts_of(dataset, one.values)
+    bad = np.zeros(values.shape, bool)
+    if found is not None:
+        bad = found.any(rest).transpose(y, x).values[places]
     edges = []
     for dim, scale in zip((1, 0), scales, strict=True):
         starts = style.joined(len(scale.at), CELLS)
@@ -133,9 +140,10 @@ def _mesh(dataset: Any, one: Quantity, x: str, y: str) -> Mesh:
             numbers = np.nan_to_num(values).astype(np.int64) if one.flags else values
             values = merge.pair.reduceat(numbers, starts, axis=dim).astype(np.float64)
             above = np.maximum.reduceat(above, starts, axis=dim)
+            bad = np.logical_or.reduceat(bad, starts, axis=dim)
             remarks.append(f"{scale.name}: {len(scale.at)} in {len(starts)} groups, the worst of each")
         edges.append(scale.edges()[[*starts, len(scale.at)]])
-    return Mesh(*scales, edges[0], edges[1], values, above, ", ".join(remarks))
+    return Mesh(*scales, edges[0], edges[1], values, above, bad, ", ".join(remarks))
 
 
 def _panel(axis: Any, one: Quantity, mesh: Mesh, log: bool | None) -> None:
@@ -176,6 +184,7 @@ def _panel(axis: Any, one: Quantity, mesh: Mesh, log: bool | None) -> None:
     _hatched(axis, mesh, np.isinf(mesh.values), *INFINITE)
     happens = one.variable in ("settled_at", "first_conflict", "first_miss", "broken_at")
     _hatched(axis, mesh, np.isnan(mesh.values), *(NEVER if happens else UNKNOWN))
+    _hatched(axis, mesh, mesh.conflicts, *CONFLICTS, face="none", edge=style.ALARM)
     _border(axis, mesh)
 
 
@@ -213,7 +222,9 @@ def _flags(axis: Any, one: Quantity, mesh: Mesh, values: np.ndarray, caption: st
     bar.set_ticks(np.arange(len(there)), labels=names)
 
 
-def _hatched(axis: Any, mesh: Mesh, mask: np.ndarray, hatch: str, text: str) -> None:
+def _hatched(
+    axis: Any, mesh: Mesh, mask: np.ndarray, hatch: str, text: str, face: str = "#eeeeee", edge: str = "#666666"
+) -> None:
     """Runs of cells to the right as one rectangle each: a hatch of single cells would cost seconds."""
     if not mask.any():
         return
@@ -229,8 +240,6 @@ def _hatched(axis: Any, mesh: Mesh, mask: np.ndarray, hatch: str, text: str) -> 
         [np.stack([left, left, right, right], axis=1), np.stack([bottom, top, top, bottom], axis=1)], axis=2
     )
     axis.add_collection(
-        PolyCollection(
-            list(corners), facecolor="#eeeeee", edgecolor="#666666", hatch=hatch, linewidth=0, label=text, zorder=1.5
-        ),
+        PolyCollection(list(corners), facecolor=face, edgecolor=edge, hatch=hatch, linewidth=0, label=text, zorder=1.5),
         autolim=False,
     )

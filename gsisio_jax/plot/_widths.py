@@ -22,7 +22,8 @@ def widths(
 
     Of many cases the median, the band from 5 to 95 % of them, and the largest. Where the noise varies along an axis,
     the lowest, the middle and the highest level are drawn, each in its colour. The dashed line is the steady width that
-    the certificate promises. Triangles at the upper edge are steps with an infinite width. Scales are logarithmic where
+    the certificate promises. Triangles at the upper edge are steps with an infinite width, red crosses steps whose data
+    contradict the stated bounds (conflicts), and a curve with some is dash-dotted. Scales are logarithmic where
     the widths span more than a factor of 30.
 
     Args:
@@ -82,23 +83,27 @@ def _panel(axis: Any, tubes: Tubes, tube: Tube) -> None:
 def _curve(axis: Any, time: np.ndarray, group: Group, color: str, alone: bool) -> list[Any]:
     """One group of cases; returns what it shows, for the choice of the scale."""
     width = group.upper - group.lower
+    bad = np.zeros(len(time), bool) if group.conflicts is None else group.conflicts.any(0)
     starts = style.joined(len(time), style.MAXIMUM_POINTS)
     if len(starts) < len(time):
         # The largest of the neighbours: no width is drawn too small.
         time, width = time[starts], np.fmax.reduceat(width, starts, axis=1)
+        bad = np.logical_or.reduceat(bad, starts)
     count = len(width)
     low, middle, high, most = (np.where(np.isinf(line), np.nan, line) for line in quantiles(width, SHARES))
     unbounded = np.isinf(width).any(axis=0)
+    dashes = "-." if bad.any() else "-"
     if count == 1:
         text = group.label or "width of the guaranteed box"
-        axis.plot(time, middle, color=color, linewidth=1.5, label=text, zorder=4)
+        axis.plot(time, middle, dashes, color=color, linewidth=1.5, label=text, zorder=4)
     else:
         text = f"median of {count} cases" + (f", {group.label}" if group.label else "")
-        axis.plot(time, middle, color=color, linewidth=1.6, label=text, zorder=4)
+        axis.plot(time, middle, dashes, color=color, linewidth=1.6, label=text, zorder=4)
         band = "5 to 95 % of them" if alone else None
         top = style.beyond(low, high, [middle, most])
         axis.fill_between(time, low, top, color=color, alpha=0.22, linewidth=0, label=band, zorder=2)
         axis.plot(time, most, ":", color=color, linewidth=1.0, label="largest of them" if alone else None, zorder=3)
+    style.mark_conflicts(axis, time, middle, bad, "conflict" if count == 1 else "conflict in some cases")
     text = "not bounded" if count == 1 else "some not bounded"
     style.mark_unbounded(axis, time, unbounded, text, color if alone else style.GREY)
     return [low, middle, most]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Record:
-    """All that is drawn, whatever it came from."""
+    """All that is drawn, whatever it came from; `outputs` where somebody asks for them by name."""
 
     title: str
     time: np.ndarray
@@ -35,6 +35,7 @@ class Record:
     series: dict[str, Series]
     missing: Any
     alarms: np.ndarray
+    outputs: dict[str, Series] = field(default_factory=dict)  # measurements that are of no signal: they have no box
 
 
 def read_record(source: Any, call: str = "framers") -> Record:
@@ -70,12 +71,21 @@ def _read_dataset(dataset: Any, call: str) -> Record:
         np.isnan(np.stack(list(outputs.values()))).all(axis=0) if outputs else _missing(variables["status"].values)
     )
     alarms = np.array([alarm["time"] for alarm in json.loads(dataset.attrs.get("alarms", "[]"))])
+    time, label = time_of(dataset)
+    nothing = np.full(len(time), np.nan)
+    of_signals = list(measured.values())
+    apart = {
+        str(name): Series(str(name), variables[name].attrs.get("units", ""), nothing, nothing, values, "output")
+        for name, values in outputs.items()
+        if not any(values is one for one in of_signals)
+    }
     title = ", ".join(part for part in (dataset.attrs.get("title", ""), told_delay(dataset)) if part)
-    return Record(title, *time_of(dataset), series, missing, alarms)
+    return Record(title, time, label, series, missing, alarms, apart)
 
 
 def _measurements(variables: Any) -> dict[str, np.ndarray]:
-    """Measurements by the signal they are of: of all names that an output begins or ends with, the longest."""
+    """Measurements by the signal they are of: the one that the attribute ``measures`` names, else of all names that an
+    output begins or ends with, the longest."""
     units = {
         variable.attrs["signal"]: variable.attrs.get("units", "")
         for variable in variables.values()
@@ -84,6 +94,9 @@ def _measurements(variables: Any) -> dict[str, np.ndarray]:
     found = {}
     for name, variable in variables.items():
         if variable.attrs.get("role") == "output":
+            if "measures" in variable.attrs:
+                found.setdefault(variable.attrs["measures"], variable.values)
+                continue
             words = f"_{str(name).removeprefix('measured_')}_"
             inside = [s for s in units if words.startswith(f"_{s}_") or words.endswith(f"_{s}_")]
             signal = max(inside, key=len, default=None)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsisio_jax.observer.status import Status
 from gsisio_jax.plot.style import short
 
 KINDS = {"state": "x", "input": "d"}
@@ -163,6 +164,22 @@ def predicted(dataset: Any, kind: str | None, signal: str) -> Any:
             found = [part for part in variable_signals(dataset, name) if part.signal in (signal, "")]
             return found[0].values if found else None
     return None
+
+
+def conflicts_of(dataset: Any, like: Any) -> Any:
+    """Which elements of a DataArray hold steps whose data contradict the bounds, over its dimensions without those of
+    its signals; None where the study did not keep it."""
+    if "conflicts" in dataset.data_vars:
+        found = dataset["conflicts"] > 0
+    elif "status" in dataset.data_vars:
+        found = (dataset["status"].fillna(0).astype(int) & int(Status.CONFLICT)) != 0
+    elif "status_any" in dataset.data_vars:
+        found = (dataset["status_any"].fillna(0).astype(int) & int(Status.CONFLICT)) != 0
+    else:
+        return None
+    found = found.any([dim for dim in found.dims if dim not in like.dims])
+    like = like.isel({dim: 0 for dim in like.dims if dim in ("statistic", *KINDS)}, drop=True)
+    return found.broadcast_like(like).transpose(*like.dims)
 
 
 def quantities(

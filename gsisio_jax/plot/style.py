@@ -207,3 +207,17 @@ def mark_unbounded(axis: Any, at: np.ndarray, bad: Any, text: str, color: str) -
             at[bad], np.ones(int(bad.sum())), "^", transform=axis.get_xaxis_transform(), clip_on=False, markersize=5,
             color=color, markeredgecolor="white", markeredgewidth=0.4, label=text, zorder=6,
         )  # fmt: skip
+
+
+def mark_conflicts(axis: Any, at: np.ndarray, line: np.ndarray, bad: Any, text: str) -> None:
+    """Red crosses on a line where data contradict the stated bounds; at the lower edge where the line has no place."""
+    bad = np.asarray(bad)
+    for where, mine, heights in (
+        (None, bad & np.isfinite(line), line),
+        (axis.get_xaxis_transform(), bad & ~np.isfinite(line), np.zeros(len(at))),
+    ):
+        if mine.any():
+            place = {} if where is None else {"transform": where, "clip_on": False}
+            axis.plot(at[mine], heights[mine], "X", color=ALARM, markersize=6, markeredgecolor="white",
+                      markeredgewidth=0.5, label=text, zorder=6, **place)  # fmt: skip
+            text = "_"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax.observer.status import Status
 from gsisio_jax.plot.record import read_record, sides_over_time, told_delay
 from gsisio_jax.plot.study import (
     KINDS,
@@ -48,6 +49,7 @@ class Group:
     upper: np.ndarray
     predicted: float | None
     truth: np.ndarray | None = None
+    conflicts: np.ndarray | None = None  # (N, T)
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class Tubes:
         level: index of the axis along which the promised widths vary (the noise), or None.
         entries: elements of that axis in words.
         ranked: the elements of that axis by increasing coordinate.
+        conflicts: steps whose data contradict the bounds, (*sizes, T); None where it is not known.
     """
 
     title: str
@@ -69,6 +72,7 @@ class Tubes:
     level: int | None = None
     entries: Sequence[str] = ()
     ranked: Sequence[int] = ()
+    conflicts: np.ndarray | None = None
 
     def chosen(self, call: str, signals: str | Sequence[str] | None) -> list[Tube]:
         """The signals to draw: those named, or all.
@@ -104,7 +108,10 @@ class Tubes:
             truth = np.broadcast_to(truth, (*tube.lower.shape[:-1], truth.shape[-1]))
             truth = cut(truth).reshape(-1, truth.shape[-1])
         rows = (-1, lower.shape[-1])
-        return Group(label, lower.reshape(rows), upper.reshape(rows), promise, truth)
+        bad = None
+        if self.conflicts is not None:
+            bad = cut(np.broadcast_to(self.conflicts, tube.lower.shape)).reshape(rows)
+        return Group(label, lower.reshape(rows), upper.reshape(rows), promise, truth, bad)
 
 
 def read_tubes(call: str, source: Any, certificate: Any = None) -> Tubes:
@@ -124,7 +131,8 @@ def read_tubes(call: str, source: Any, certificate: Any = None) -> Tubes:
     else:
         record = read_record(source, call)
         series = {n: Tube(n, one.unit, one.kind, one.lower, one.upper) for n, one in record.series.items()}
-        tubes = Tubes(record.title, record.time, record.time_label, series)
+        bad = np.isin(record.time, record.alarms)
+        tubes = Tubes(record.title, record.time, record.time_label, series, conflicts=bad)
     return tubes if certificate is None else replace(tubes, series=_promised(call, tubes.series, certificate))
 
 
@@ -141,7 +149,9 @@ def _of_estimate(call: str, est: Any) -> Tubes:
             name = f"{letter}{i + 1}"
             series[name] = Tube(name, "", kind, lower[..., i], upper[..., i])
     lead = tuple(f"axis {i}" for i in range(np.ndim(est.state.lower) - 2))
-    return Tubes(told_delay(est), np.arange(np.shape(est.state.lower)[-2], dtype=np.float64), "step", series, lead)
+    bad = (np.asarray(est.status) & int(Status.CONFLICT)) != 0
+    steps = np.arange(np.shape(est.state.lower)[-2], dtype=np.float64)
+    return Tubes(told_delay(est), steps, "step", series, lead, conflicts=bad)
 
 
 def _of_study(dataset: Any) -> Tubes:
@@ -160,7 +170,11 @@ def _of_study(dataset: Any) -> Tubes:
                 shape = [promise.sizes.get(axis, 1) for axis in mine]
                 promise = np.asarray(promise.values, dtype=np.float64).reshape(shape)
             series[low.signal] = Tube(low.signal, low.unit, kind, lower, upper, promise)
-    found = Tubes(title_of(dataset), *time_of(dataset), series, axes)
+    bad = None
+    if "status" in dataset.data_vars:
+        status = dataset["status"].transpose(*(a for a in axes if a in dataset["status"].dims), "time").values
+        bad = (np.nan_to_num(status).astype(int) & int(Status.CONFLICT)) != 0
+    found = Tubes(title_of(dataset), *time_of(dataset), series, axes, conflicts=bad)
     if level is None:
         return found
     values = dataset[axes[level]].values

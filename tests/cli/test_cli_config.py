@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import re
+from typing import get_args
+
 import pytest
+from pydantic import BaseModel
+
+from gsisio_jax.cli.config import Config
+from gsisio_jax.cli.help import EXAMPLES
 
 CASES = {
     "unknown key": ('time = "t"', 'tiem = "t"', ["cart.toml: unknown key table.tiem; did you mean time?"]),
@@ -151,3 +158,22 @@ def test_debug_shows_the_traceback(project):
     project.edit("sample_time = 0.1", "")
     with pytest.raises(ValueError, match=r"table\.sample_time is missing"):
         project.run("--debug")
+
+
+def test_the_help_of_estimate_names_every_key_of_a_configuration():
+    def models(annotation):
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            yield annotation
+        for part in get_args(annotation):
+            yield from models(part)
+
+    def keys(model):
+        for name, field in model.model_fields.items():
+            if model is Config and name in ("sweep", "monte_carlo"):  # they have a help of their own
+                continue
+            yield field.alias or name
+            for inner in models(field.annotation):
+                yield from keys(inner)
+
+    missing = {key for key in keys(Config) if not re.search(rf"\b{key}\b", EXAMPLES)}
+    assert missing == set()

@@ -59,7 +59,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Folder]:
     with pytest.MonkeyPatch.context() as patch:
         made: list[Any] = []
 
-        def once(problem: Any) -> Any:
+        def once(problem: Any, progress: Any = None) -> Any:
             made[:] = made or [design(problem)]
             return made[0]
 
@@ -307,7 +307,7 @@ def test_a_main_thread_that_cannot_hear_does_not_keep_the_user_waiting():
 
 
 def test_stopped_before_the_first_tile(done, tmp_path, monkeypatch):
-    def stop(problem):
+    def stop(problem, progress=None):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("gsisio_jax.cli.study.design", stop)
@@ -321,6 +321,6 @@ def test_a_lost_truth_is_exit_code_1(done, tmp_path, monkeypatch):
         raise gx.ContainmentLost("a box misses the truth in run 7 at step 3")
 
     monkeypatch.setattr("gsisio_jax.monte_carlo", lose)
-    monkeypatch.setattr("gsisio_jax.cli.study.design", lambda problem: None)
+    monkeypatch.setattr("gsisio_jax.cli.study.design", lambda problem, progress=None: None)
     line = "gsisio: a box misses the truth in run 7 at step 3 (here monte_carlo.seed is 0)\n"
     assert run("monte-carlo", done.config, "--out", str(tmp_path)) == (1, "", line)

@@ -76,9 +76,29 @@ def test_long_records_keep_their_widest_box():
     radius = np.ones((50_001, 1))
     radius[12_345] = 5.0
     long.state, long.input = Interval(-radius, radius), Interval(-radius[1:], radius[1:])
+    long.status = np.zeros(50_001, int)
     line = line_of(plot.widths(long, "x1")[0], "width of the guaranteed box")
     assert len(line.get_ydata()) <= 3000
     assert line.get_ydata().max() == 10.0
+
+
+def test_steps_with_conflicts_are_marked():
+    """The status of every case of the study is CONFLICT at step 9; the first four of the second one are clean."""
+    data = kept(8).isel(level=2)
+    data["status"][:4] = 0
+    (axis,) = plot.widths(data, "position")
+    assert line_of(axis, "conflict in some cases").get_xdata().tolist() == [TIME[9]]
+    assert line_of(axis, "median of 8 cases").get_linestyle() == "-."
+    (axis,) = plot.funnel(data)
+    assert line_of(axis, "conflict").get_xdata().tolist() == [TIME[9]]
+    assert sum(line.get_linestyle() == "-." for line in axis.lines) == 8  # both sides of four cases
+    est = estimates()
+    est.status[[3, 5]] = 1
+    (x, _) = plot.widths(est)
+    assert line_of(x, "conflict").get_xydata().tolist() == [[3, 8.0], [5, 12.0]]
+    assert line_of(x, "width of the guaranteed box").get_linestyle() == "-."
+    (x, _) = plot.widths(estimates())
+    assert line_of(x, "width of the guaranteed box").get_linestyle() == "-"
 
 
 def hull_of(axis):

@@ -49,7 +49,10 @@ def test_a_heat_map_needs_no_arguments():
     expected[3, 5], expected[2, 0] = np.nan, np.nan
     drawn = np.ma.filled(mesh_of(axes[0]).get_array().reshape(4, 6), np.nan)
     np.testing.assert_array_equal(drawn, expected)
-    assert set(legend_of(axes)) == {"infinite: not bounded", "no value", "border to widths above the certificate"}
+    assert set(legend_of(axes)) == {
+        "infinite: not bounded", "no value", "border to widths above the certificate",
+        "with conflicts: data contradict the bounds",
+    }  # fmt: skip
 
 
 def test_numeric_axes_are_to_scale_and_every_cell_holds_its_coordinate():
@@ -105,7 +108,7 @@ def test_one_number_everywhere_and_none_at_all_are_said():
     never = swept().assign(settled_at=swept()["settled_at"] * np.nan)
     (axis,) = plot.heatmap(never, "settled_at")
     assert axis.get_title() == "step of settling"
-    assert legend_of([axis]) == ["never"]
+    assert legend_of([axis]) == ["never", "with conflicts: data contradict the bounds"]
 
 
 def test_a_bit_mask_has_a_color_for_every_combination():
@@ -235,3 +238,29 @@ def test_one_selected_signal_is_still_known():
     (axis,) = plot.heatmap(swept().isel(state=1))
     assert axis.get_title() == "speed"
     assert bar_of(axis).ax.get_ylabel() == "last width [m/s]"
+
+
+def test_cases_with_conflicts_are_drawn_differently():
+    """The element (size 2, second level) of the study has conflicts."""
+    data = swept().sel(size=[1.0, 2.0])
+    (axis, _) = plot.curves(data, x="level")
+    plain, broken = (line_of(axis, f"size = {size} m") for size in (1, 2))
+    assert (plain.get_linestyle(), broken.get_linestyle()) == ("-", "-.")
+    cross = line_of(axis, "with conflicts")
+    np.testing.assert_allclose(cross.get_xydata(), [[LEVELS[1], 2 * LEVELS[1]]])
+    clean = swept().drop_vars("status_any")
+    assert "with conflicts" not in legend_of(plot.curves(clean.sel(size=[1.0, 2.0]), x="level"))
+    (axis, _) = plot.heatmap(swept())
+    (path,) = hatched(axis)["with conflicts: data contradict the bounds"].get_paths()
+    assert path.contains_point((LEVELS[1], 2.0))
+    assert not path.contains_point((LEVELS[2], 2.0))
+
+
+def test_conflicts_of_some_of_many_cases():
+    data = runs()
+    count = np.zeros((6, 60), int)
+    count[1, 7], count[3] = 2, 1
+    data["conflicts"] = (("level", "run"), count)
+    (axis, _) = plot.curves(data, "state_width_final")
+    np.testing.assert_allclose(line_of(axis, "conflicts in some cases").get_xdata(), LEVELS[[1]])
+    np.testing.assert_allclose(line_of(axis, "conflicts in all cases").get_xdata(), LEVELS[[3]])

@@ -1,0 +1,77 @@
+"""Gains of a design that knows no bounds, kept so that a true bound never widens a box.
+
+The certified gain is the best one for its own steady width. With a bound more it may lean on that where data would have
+said more: boxes are intersections, and mostly narrower than the steady width. So the rows of the gain without the bound
+are kept beside those of the certified one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from gsisio_jax.design.gain_selection import main_gain, typical_width, units
+from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.errors import NoDesignFound
+from gsisio_jax.interval.box import Interval
+
+_SHARES = (1.0, 0.3, 0.1, 0.0)  # of the steady width, at which rows are compared
+_BETTER = 1e-6  # share of the width that a row must bring somewhere
+
+
+def gains_with_less(problem: GainProblem, bank: list[np.ndarray], region: Interval) -> list[np.ndarray]:
+    """Gains whose rows are those of the design without the state bounds, without the input bounds, and without both.
+
+    Args:
+        problem: of the design.
+        bank: gains that are kept already, the certified one in front.
+        region: of the design.
+
+    Returns:
+        As few gains as hold the rows that are better than the certified ones for boxes of some size; a gain has the
+        certified row for a state of which there is no other.
+    """
+    main = bank[0]
+    steady = problem.steady_width(main)
+    width = units(steady) if np.isfinite(steady).all() else typical_width(problem, region)
+    rows: list[list[np.ndarray]] = [[] for _ in range(problem.n)]
+    for less, usable in _cases(problem):
+        try:
+            gain = main_gain(less, region, usable)
+        except NoDesignFound:
+            continue
+        for i in range(problem.n):
+            known = [*(kept[i] for kept in bank), *rows[i]]
+            if not any(_same(gain[i], row) for row in known) and _helps(problem, gain, main, i, width):
+                rows[i].append(gain[i])
+    count = max(map(len, rows), default=0)
+    return [np.stack([mine[k] if k < len(mine) else main[i] for i, mine in enumerate(rows)]) for k in range(count)]
+
+
+def _cases(problem: GainProblem) -> Iterator[tuple[GainProblem, np.ndarray]]:
+    """The problems that know less, and which entries of a gain they may use."""
+    everything = np.full(problem.columns, True)
+    unbounded = everything.copy()
+    unbounded[problem.l + problem.q :] = False
+    free = replace(problem, free=np.full(len(problem.free), True), dd=np.zeros(0))
+    states, inputs = bool(len(problem.ds)), bool(len(problem.dd))
+    if states:
+        yield problem, unbounded
+    if inputs:
+        yield free, everything
+    if states and inputs:
+        yield free, unbounded
+
+
+def _helps(problem: GainProblem, gain: np.ndarray, main: np.ndarray, i: int, width: np.ndarray) -> bool:
+    """Is this row narrower than the certified one for boxes of some size?"""
+    return any(
+        problem.row_cost(gain, share * width)[i] < problem.row_cost(main, share * width)[i] * (1 - _BETTER)
+        for share in _SHARES
+    )
+
+
+def _same(row: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.allclose(row, other, rtol=1e-7, atol=1e-12))

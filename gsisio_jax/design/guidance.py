@@ -1,0 +1,255 @@
+"""What would help where a design fails: one more sensor or one more bound at a time, each tried on the changed plant.
+
+Slopes of the changed plant are those of the plant: a sensor adds a row of the identity, a bound of an input changes
+none, and with a bound of a state they are enclosed anew. So the tests that the design begins with (existence, rank, a
+gain, a first box) cost a small linear program for each of them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from gsisio_jax.design.assemble import Plan
+from gsisio_jax.design.existence import check_existence, check_rank
+from gsisio_jax.design.gain_selection import main_gain
+from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.certificate import spectral_radius
+from gsisio_jax.observer.enclosures import Slopes, affine_on_state_bounds
+from gsisio_jax.plant.system import Noise
+
+_MOST = 12  # candidates of a kind: plants with more states are told of the first ones
+_SINGULAR = 1e-6  # determinants below this are not divided by, as in the design
+_RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class Changed:
+    """A plant with one thing more known, as far as gain problems read it.
+
+    Attributes:
+        kind: "sensor", "input_bounds" or "state_bounds"; "nothing" for the plant as it is.
+        index: of the state or the input.
+        plan: of the changed plant.
+        region, everywhere: enclosures of its slopes on the region and on the state bounds.
+    """
+
+    kind: str
+    index: int
+    plan: Plan
+    region: Slopes
+    everywhere: Slopes
+
+
+def what_helps(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval | None) -> str:
+    """Lines that say which further sensor or bound makes a design possible; each was tried.
+
+    Args:
+        plan: of the plant that has none.
+        slopes_on: from `slopes_of`.
+        region: of the design; None where it was to be found.
+    """
+    region = _place(plan, region)
+    if not slopes_on(region).finite:
+        return ""
+    found: dict[tuple[str, bool], list[int]] = {}
+    for one in _changes(plan, slopes_on, region):
+        verdict = _verdict(one)
+        if verdict is not None:
+            found.setdefault((one.kind, verdict), []).append(one.index)
+    if not found:
+        return "\nTried: neither one more state measured nor one more bound of a state or an input is enough by itself."
+    lines = [
+        f"  {_words(kind, members)}: {'widths settle' if settles else 'finite boxes, but no width settles'}"
+        for (kind, settles), members in sorted(found.items(), key=lambda item: not item[0][1])
+    ]
+    return "\nTried one by one, each of these is enough:\n" + ";\n".join(lines) + "."
+
+
+def what_settles(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> str:
+    """Which further sensor or bound makes widths settle where they do not; "" where none of them alone does."""
+    return _one_of("widths would settle", plan, slopes_on, region, lambda one: _verdict(one) is True)
+
+
+def what_recovers(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> str:
+    """Which further sensor or bound makes boxes finite again after a lost row; "" where none of them alone does."""
+    found = _one_of("after a lost row boxes would become finite again", plan, slopes_on, region, _recovers)
+    return found or "after a lost row no single further sensor or bound makes boxes finite again (tried)"
+
+
+def _one_of(
+    what: str,
+    plan: Plan,
+    slopes_on: Callable[[Interval], Slopes],
+    region: Interval,
+    works: Callable[[Changed], bool],
+) -> str:
+    found: dict[str, list[int]] = {}
+    for one in _changes(plan, slopes_on, region):
+        if works(one):
+            found.setdefault(one.kind, []).append(one.index)
+    ways = "; or ".join(_words(kind, members) for kind, members in found.items())
+    return f"{what} with one of these (tried): {ways}" if ways else ""
+
+
+def _words(kind: str, members: list[int]) -> str:
+    names = [str(index + 1) for index in members]
+    which = f"{', '.join(names[:-1])} or {names[-1]}" if len(names) > 1 else names[0]
+    if kind == "sensor":
+        return f"measure state {which} as well"
+    return f"`{kind}` with two finite sides for {kind.removesuffix('_bounds')} {which}"
+
+
+def starts(plan: Plan, problem: GainProblem, gain: np.ndarray, here: Slopes, everywhere: Slopes) -> bool:
+    """Would the first box of a step be finite with this gain of the plant as it is?"""
+    return _starts(Changed("nothing", 0, plan, here, everywhere), problem, gain)
+
+
+def _place(plan: Plan, region: Interval | None) -> Interval:
+    center = np.asarray(plan.system.state_bounds.center, np.float64)
+    return Interval(center, center) if region is None else region
+
+
+def _changes(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> Iterator[Changed]:
+    system = plan.system
+    bounds, known = system.state_bounds, system.input_bounds
+    here, everywhere = slopes_on(region), slopes_on(bounds)
+    if not here.finite:
+        return
+    n, p = system.n, system.p
+    unmeasured = [i for i in range(n) if not _measured(everywhere, i)]
+    for i in unmeasured[:_MOST]:
+        T2 = np.pad(plan.feedthrough.T2, ((0, 1), (0, 1)))
+        T2[-1, -1] = 1.0
+        v = plan.noise.v
+        yield Changed(
+            "sensor",
+            i,
+            Plan(
+                _like(plan, H=np.vstack([system.H, np.zeros((1, p))])),
+                Noise(plan.noise.w, Interval(np.append(v.lower, -1.0), np.append(v.upper, 1.0))),
+                replace(plan.feedthrough, T2=T2),
+                plan.u_region,
+            ),
+            _with_row(here, i),
+            _with_row(everywhere, i),
+        )
+    for j in np.flatnonzero(~np.isfinite(np.asarray(known.width)))[:_MOST]:
+        box = _bounded(known, j, -1.0, 1.0)
+        yield Changed("input_bounds", int(j), replace(plan, system=_like(plan, input_bounds=box)), here, everywhere)
+    for i in np.flatnonzero(~np.isfinite(np.asarray(bounds.width)))[:_MOST]:
+        low, high = float(region.lower[i]), float(region.upper[i])
+        if not (np.isfinite([low, high]).all() and low < high):
+            low, high = low - 1.0 if np.isfinite(low) else -1.0, high + 1.0 if np.isfinite(high) else 1.0
+        box = _bounded(bounds, i, low, high)
+        yield Changed("state_bounds", int(i), replace(plan, system=_like(plan, state_bounds=box)), here, slopes_on(box))
+
+
+def _like(plan: Plan, **changes: Any) -> Any:
+    """What gain problems read of a system, changed."""
+    system = plan.system
+    parts = {"G": system.G, "H": system.H, "state_bounds": system.state_bounds, "input_bounds": system.input_bounds}
+    return SimpleNamespace(**{**parts, **changes}, n=system.n, p=system.p, measurement=system.measurement)
+
+
+def _measured(slopes: Slopes, i: int) -> bool:
+    """Is there an output that is this state alone, but for a factor and the unknown input?"""
+    rows = (slopes.Z != 0) | (slopes.Z_radius != 0)
+    return bool((rows[:, i] & (rows.sum(1) == 1) & (slopes.Z_radius[:, i] < np.abs(slopes.Z[:, i]))).any())
+
+
+def _with_row(slopes: Slopes, i: int) -> Slopes:
+    row = np.eye(slopes.F.shape[0])[i : i + 1]
+    E, Z = np.vstack([slopes.E, row]), np.vstack([slopes.Z, row])
+    radii = (np.vstack([radius, 0 * row]) for radius in (slopes.E_radius, slopes.Z_radius))
+    E_radius, Z_radius = radii
+    return Slopes(slopes.F, slopes.F_radius, E, E_radius, Z, Z_radius)
+
+
+def _bounded(box: Interval, i: int, low: float, high: float) -> Interval:
+    lower, upper = np.array(box.lower, np.float64), np.array(box.upper, np.float64)
+    lower[i] = lower[i] if np.isfinite(lower[i]) else min(low, upper[i] - 1.0)
+    upper[i] = upper[i] if np.isfinite(upper[i]) else max(high, lower[i] + 1.0)
+    return Interval(lower, upper)
+
+
+def _verdict(one: Changed) -> bool | None:
+    """Do widths settle? None where there is no observer with finite boxes all the same."""
+    problem = one.plan.problem(one.region)
+    with contextlib.suppress(ObserverDoesNotExist, NoDesignFound):
+        check_existence(one.plan.system, one.plan.feedthrough, one.everywhere)
+        check_rank(problem)
+        gain = main_gain(problem, Interval.entire(problem.n))
+        if _starts(one, problem, gain):
+            return bool(np.isfinite(problem.steady_width(gain)).all())
+    return None
+
+
+def _starts(one: Changed, problem: GainProblem, gain: np.ndarray) -> bool:
+    """Is the first contraction of a step finite (`check_initial_contraction`)?"""
+    reached = (problem.G[:, problem.free] != 0).any(axis=1)
+    if np.isfinite(np.asarray(one.plan.system.state_bounds.width))[reached].all():
+        return True
+    N_z, C = problem.split(gain)[1], problem.C[: problem.q]
+    used = (N_z != 0).any(axis=0)
+    R = (np.abs(one.everywhere.Z - C) + one.everywhere.Z_radius)[used]
+    if np.isfinite(R).all() and spectral_radius(np.abs(N_z[:, used]) @ R) < 1:
+        return True
+    slope, finite = _first_form(one)
+    matrix = np.eye(problem.n) + N_z[:, used] @ (slope - C)[used]
+    return bool(finite[used].all()) and abs(np.linalg.det(matrix)) > _SINGULAR
+
+
+def _first_form(one: Changed) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes (q, n) of the affine bounds of T2 g on the state bounds, and which of them have a finite remainder."""
+    system, T2 = one.plan.system, one.plan.feedthrough.T2
+    if one.everywhere.near_affine(one.everywhere.Z_radius):
+        return one.everywhere.Z, np.full(len(T2), True)
+    inner = T2[:-1, :-1] if one.kind == "sensor" else T2
+    form, _ = affine_on_state_bounds(
+        lambda x, u: inner @ system.measurement(x, u), system, one.plan.u_region, np.float64
+    )
+    slope = np.asarray(form.slope, np.float64)
+    finite = np.isfinite(form.offset.lower) & np.isfinite(form.offset.upper)
+    if one.kind == "sensor":
+        return np.vstack([slope, np.eye(system.n)[one.index]]), np.append(finite, True)
+    return slope, finite
+
+
+def _recovers(one: Changed) -> bool:
+    """Do the measurements determine the state when nothing is known of the past: at once, or (where f and g are affine)
+    within n + 4 steps, whatever the unknown input does?"""
+    system = one.plan.system
+    bounded = np.eye(system.n)[np.isfinite(np.asarray(system.state_bounds.width))]
+    slope, finite = _first_form(one)
+    if _rank(np.vstack([slope[finite], bounded])) == system.n:
+        return True
+    if not one.everywhere.affine:
+        return False
+    free = ~np.isfinite(np.asarray(system.input_bounds.width))
+    G, H = np.asarray(system.G)[:, free], np.asarray(system.H)[:, free]
+    steps = system.n + 4
+    state = np.hstack([np.eye(system.n), np.zeros((system.n, steps * G.shape[1]))])
+    seen: list[np.ndarray] = []
+    for k in range(steps):
+        now = np.zeros((G.shape[1], state.shape[1]))
+        now[:, system.n + k * G.shape[1] : system.n + (k + 1) * G.shape[1]] = np.eye(G.shape[1])
+        seen += [one.everywhere.E @ state + H @ now, bounded @ state]
+        outputs = np.vstack(seen)
+        if _rank(outputs) == _rank(np.vstack([outputs, state])):
+            return True
+        state = one.everywhere.F @ state + G @ now
+    return False
+
+
+def _rank(matrix: np.ndarray) -> int:
+    norms = np.linalg.norm(matrix, axis=1, keepdims=True)
+    singular = np.linalg.svd(matrix / np.where(norms > 0, norms, 1.0), compute_uv=False)
+    return int((singular > _RANK * singular.max(initial=0.0)).sum()) if len(singular) else 0

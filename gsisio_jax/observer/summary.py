@@ -1,0 +1,117 @@
+"""What a run was like, in a few lines: conflicts, gaps, and where the width promise did not apply."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from gsisio_jax.observer.status import Status
+
+if TYPE_CHECKING:
+    from gsisio_jax.observer.estimation import Estimate
+
+NEARLY_ALL = 0.75  # of the steps with measurements: so many conflicts are no faults
+
+
+@dataclass(frozen=True)
+class Outside:
+    """Steps for which no width is promised, because of where they are.
+
+    Attributes:
+        steps: of the run.
+        outside: of them with the status OUTSIDE_REGION: the box or u of this step, or of the one before, is outside.
+        boxes: steps whose box is not inside the region; None where it is not known.
+        inputs: steps whose u is not inside `u_region`; None where it is not known.
+    """
+
+    steps: int
+    outside: int
+    boxes: int | None = None
+    inputs: int | None = None
+
+    def __str__(self) -> str:
+        if not self.outside:
+            return f"0 of {self.steps} steps"
+        reasons = [
+            f"{what} at {count}"
+            for what, count in (("the box leaves the region", self.boxes), ("u leaves u_region", self.inputs))
+            if count
+        ]
+        why = f" ({', '.join(reasons)})" if reasons else ""
+        return (
+            f"{self.outside} of {self.steps} steps{why}: {percent(self.outside / self.steps)} without a promised width"
+        )
+
+    def of_promise(self) -> str:
+        """What a certificate that holds in its region is worth for this run; "" where it applies throughout."""
+        if not self.outside:
+            return ""
+        applies = self.steps - self.outside
+        at = "at no step" if not applies else f"at {applies} of {self.steps} steps"
+        remedies = [
+            *(["a region around the run (`around`), or a larger one"] if self.boxes else []),
+            *(["a `u_region` that holds the known inputs"] if self.inputs else []),
+        ]
+        remedy = f"; what may help: {', and '.join(remedies)}" if remedies else ""
+        return f"applies {at} of this run: elsewhere boxes are certain, and no width is promised{remedy}"
+
+
+def units_hint(conflicts: int, steps: int) -> str:
+    """What so many conflicts are a sign of; "" where there are fewer.
+
+    Args:
+        conflicts: steps (or cases) whose data contradict the bounds.
+        steps: all that have data.
+    """
+    if not conflicts or conflicts < NEARLY_ALL * steps:
+        return ""
+    return (
+        "nearly all of them contradict the stated bounds: no fault of the plant, but of the model or its bounds. "
+        "Units? (degrees and radians, km/h and m/s, percent; order of columns; sample time; noise bounds too small)"
+    )
+
+
+def summary(est: Estimate, observer: Any = None, u: Any = None) -> str:
+    """The lines of `Estimate.summary`."""
+    status = np.asarray(est.status)
+    steps, missing = status.size, _count(status, Status.MISSING)
+    conflicts = _count(status, Status.CONFLICT)
+    facts = [
+        ("steps", f"{steps}"),
+        ("conflicts", ": ".join(filter(None, (f"{conflicts}", units_hint(conflicts, steps))))),
+        ("missing", f"{missing} steps with missing entries"),
+        ("unbounded", f"{_count(status, Status.UNBOUNDED)} steps with a state that is not bounded"),
+        ("no promise", str(where(est, observer, u))),
+    ]
+    if observer is not None and not observer.certificate.self_consistent:
+        kind = "empty" if observer.certificate.certified else "none"
+        facts[-1] = ("no promise", f"at all: the certificate is {kind}; print(observer.certificate) says why")
+    return "\n".join(f"{name:<12}{text}" for name, text in facts)
+
+
+def where(est: Estimate, observer: Any = None, u: Any = None) -> Outside:
+    """Where the promise of the observer does not apply; counts by reason as far as `observer` and `u` tell."""
+    status = np.asarray(est.status)
+    boxes = inputs = None
+    if observer is not None:
+        region = observer.certificate.region
+        boxes = int(np.count_nonzero(beyond(est.state.lower, est.state.upper, region)))
+        inputs = None if u is None else int(np.count_nonzero(beyond(u, u, observer.u_region)))
+    return Outside(status.size, _count(status, Status.OUTSIDE_REGION), boxes, inputs)
+
+
+def beyond(lower: Any, upper: Any, box: Any) -> np.ndarray:
+    """Rows (..., T) of boxes that do not lie inside another one, (n,)."""
+    lower, upper = np.asarray(lower), np.asarray(upper)
+    return ~((lower >= np.asarray(box.lower)) & (upper <= np.asarray(box.upper))).all(-1)
+
+
+def percent(share: float) -> str:
+    """Rounding does not turn some into none, nor nearly all into all."""
+    return f"{100 * share:.3g} %" if share in (0.0, 1.0) or 0.001 < share < 0.999 else f"{100 * share:.6g} %"
+
+
+def _count(status: np.ndarray, bit: Status) -> int:
+    return int(np.count_nonzero(status & int(bit)))

@@ -1,0 +1,105 @@
+"""What would help is computed: every suggestion works when it is followed, and what is not suggested does not."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gsisio_jax as gx
+from gsisio_jax import Interval
+
+
+def ball(*radii):
+    return Interval.symmetric(radii)
+
+
+def chain(x):
+    return jnp.stack([x[0] + 0.1 * x[1], x[1] - 0.1 * jnp.sin(x[0]), 0.5 * x[2]])
+
+
+def plant(measured=(0,), **known):
+    """A pendulum and a state apart, an unknown torque; some of its states are measured."""
+    rows = list(measured)
+    return gx.System(
+        chain, lambda x: jnp.stack([x[i] for i in rows]), G=[[0.0], [0.1], [0.0]], H=np.zeros((len(rows), 1)), **known
+    )  # fmt: skip
+
+
+def design(system, **options):
+    noise = gx.Noise(ball(0.01, 0.01, 0.01), Interval.symmetric([0.1] * system.l))
+    return gx.design_observer(system, noise, ball(2.0, 2.0, 2.0), **{"missing": False, **options})
+
+
+def test_suggestions_of_a_plant_without_an_observer_work_and_the_others_do_not():
+    with pytest.raises(gx.ObserverDoesNotExist) as error:
+        design(plant())
+    head, *lines = str(error.value).splitlines()
+    assert "delay=1" in head
+    assert lines == [
+        "Tried one by one, each of these is enough:",
+        "  measure state 2 as well: widths settle;",
+        "  `input_bounds` with two finite sides for input 1: widths settle;",
+        "  `state_bounds` with two finite sides for state 2: widths settle.",
+    ]
+    inf = np.inf
+    for system in (
+        plant((0, 1)),
+        plant(input_bounds=ball(3.0)),
+        plant(state_bounds=ball(inf, 2.0, inf)),
+    ):
+        assert design(system).certificate.certified
+    for system in (plant((0, 2)), plant(state_bounds=ball(2.0, inf, 2.0))):
+        with pytest.raises(gx.ObserverDoesNotExist):
+            design(system)
+
+
+def test_where_one_thing_more_is_not_enough_that_is_said():
+    blind = gx.System(lambda x: 0.5 * x, lambda x: x[:1], G=np.eye(3), H=np.zeros((1, 3)))
+    with pytest.raises(gx.ObserverDoesNotExist, match="neither one more state measured nor one more bound"):
+        design(blind)
+
+
+def test_a_smaller_region_is_proposed_only_where_it_works():
+    """g = x + 1.2 sin x: steep enough on a smaller region, and its first box is finite everywhere."""
+    noise = gx.Noise(ball(0.1), ball(0.1))
+
+    def scalar(g, region):
+        return gx.design_observer(gx.System(lambda x: 0.5 * x, g, [[1.0]], [[0.0]]), noise, region, missing=False)
+
+    with pytest.raises(gx.NoDesignFound) as error:
+        scalar(lambda x: x + 1.2 * jnp.sin(x), ball(3.0))
+    scale = float(str(error.value).split("Scaled by ")[1].split(" ")[0])
+    assert scalar(lambda x: x + 1.2 * jnp.sin(x), ball(3.0 * scale)).certificate.certified
+    # x**2 - 2 x: slopes vanish at 1; around 0 there is a gain, but no first box, so nothing smaller is proposed.
+    with pytest.raises(gx.NoDesignFound) as error:
+        scalar(lambda x: x**2 - 2 * x, Interval([-1.5], [1.5]))
+    assert "A smaller region about the same centre alone does not help" in str(error.value)
+    assert "Scaled by" not in str(error.value)
+    with pytest.raises(gx.NoDesignFound, match="a smaller region alone does not help"):
+        scalar(lambda x: x**2 - 2 * x, Interval([-0.1], [0.1]))
+
+
+def test_what_would_make_widths_settle_is_noted():
+    drift = gx.System(lambda x: x, lambda x: x[:1], G=[[1.0], [0.0], [0.0]][:2], H=[[0.0]])
+    noise = gx.Noise(ball(0.1, 0.1), ball(0.1))
+    found = gx.design_observer(drift, noise, Interval.entire(2), missing=False).certificate
+    assert not found.certified
+    assert found.notes == (
+        "widths would settle with one of these (tried): measure state 2 as well; or `state_bounds` with two finite "
+        "sides for state 2",
+    )
+
+
+def test_what_would_bring_boxes_back_after_a_lost_row_is_noted():
+    """y sees x1 - x2 and an input moves both: y[k-1] is needed, and after a lost row it is not there. Any single state
+    that is measured ends that."""
+    example = gx.examples.load("paper")
+    found = gx.design_observer(example.system, example.noise, example.region).certificate
+    assert found.recoverable is False
+    assert found.notes[-1].startswith("after a lost row boxes would become finite again with one of these (tried): ")
+    system = example.system
+    seen = gx.System(
+        system.f, lambda x: jnp.concatenate([system.g(x), x[:1]]), system.G, np.vstack([system.H, np.zeros((1, 2))])
+    )
+    noise = gx.Noise(example.noise.w, Interval.symmetric([0.2, 0.2, 0.2]))
+    assert "measure state 1" in found.notes[-1]
+    assert gx.design_observer(seen, noise, example.region).certificate.recoverable
