@@ -67,7 +67,7 @@ class NoisePart(Part):
 class DesignPart(Part):
     """Options of ``design_observer``; what is left out keeps the library's default."""
 
-    gains: Annotated[int, Field(ge=1)] | None = None
+    gains: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
     missing: bool | None = None
     sweeps: Annotated[int, Field(ge=1)] | None = None
     window: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None

@@ -36,7 +36,7 @@ def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_reg
             observer.certificate, recoverable=True, recovery_steps=(rows.length,) * n,
             recovery_width=np.asarray(rows.width, np.float64),
         )  # fmt: skip
-    trial = _Trial.of(observer, u_region)
+    trial = Trial.of(observer, u_region)
     if trial is None:
         return replace(observer.certificate, recoverable=False)
     lost = trial.rows.copy()
@@ -49,7 +49,7 @@ def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_reg
     return replace(observer.certificate, recoverable=recoverable, recovery_steps=steps, recovery_width=widths[-1])
 
 
-class _Trial:
+class Trial:
     """A noise-free run from the centre of the region over n + 5 steps. In NumPy: a few steps take less time than the
     compilation of one."""
 
@@ -59,7 +59,7 @@ class _Trial:
         self.step: Any = None
 
     @classmethod
-    def of(cls, observer: Observer | DelayedObserver, u_region: Interval) -> _Trial | None:
+    def of(cls, observer: Observer | DelayedObserver, u_region: Interval) -> Trial | None:
         """None where the trajectory leaves the domain of f or g: nothing can be said for it."""
         system = observer.system
 

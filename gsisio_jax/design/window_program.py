@@ -10,6 +10,7 @@ from scipy import sparse
 from scipy.optimize import linprog
 
 from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.design.window_runs import Rows
 
 _SMALL = 1e-9  # multipliers below this are what a solver leaves, in units of the noise and the boxes
 
@@ -108,3 +109,22 @@ class WindowProgram:
             if np.abs(self.equal @ x + self.equal_offset[:, state]).max() > _SMALL:
                 return None
         return x
+
+
+def rows_of_gains(problem: GainProblem, gains: list[np.ndarray], length: int) -> Rows:
+    """What gains of one step say, as rows of a window: those that use no bounds of states and cancel free inputs."""
+    P, found = problem, Rows([], [])
+    older = length - 1
+    b = int((~P.free).sum())
+    for N in gains:
+        N_y, N_z, N_s = P.split(N)
+        left = P.residual(N)
+        weight = np.eye(P.n) - N_z @ P.C[: P.q]
+        for i in range(P.n):
+            if N_s[i].any() or np.abs(left[i, P.free]).max(initial=0.0) > _SMALL:
+                continue
+            latest = [weight[i] @ P.F - N_y[i] @ P.E, weight[i], N_y[i]]
+            blocks = [np.concatenate([np.zeros(older * len(part)), part]) for part in latest]
+            known = np.concatenate([np.zeros(older * b), left[i, ~P.free]])
+            found.add(i, np.concatenate([*blocks, N_z[i] @ P.T2, N_z[i], known]))
+    return found

@@ -55,6 +55,8 @@ class Runs:
         below, above = [np.tile(self.start, (RUNS, 1))], [np.tile(self.start, (RUNS, 1))]
         parts = np.array(rows.parts)
         belongs = np.array(rows.states)
+        most = FAR * self.start
+        most[P.bounded_states] = P.ds / 2  # of a state in the middle of its bounds
         found = []
         for k in range(1, total):
             size, drift = self._terms(below, above, w, v, k)
@@ -63,7 +65,7 @@ class Runs:
             for sign in (-1, 1):
                 reach = spread + sign * moved
                 best = [reach[:, belongs == i].min(1, initial=np.inf) for i in range(n)]
-                sides.append(np.minimum(np.stack(best, 1), FAR * self.start))
+                sides.append(np.minimum(np.stack(best, 1), most))
             below.append(sides[0])
             above.append(sides[1])
             if k > N + 3:
