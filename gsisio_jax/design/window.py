@@ -11,7 +11,7 @@ import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window_program import WindowProgram, rows_of_gains
-from gsisio_jax.design.window_runs import FAR, RUNS, Rows, Runs, sizes_of_parts
+from gsisio_jax.design.window_runs import FAR, RUNS, Rows, Runs, measured, sizes_of_parts
 from gsisio_jax.observer.window import Window
 
 _ROUNDS, _SAMPLES = 4, 6  # rounds, each of runs with all rows so far; steps of a round for which exact rows are asked
@@ -21,7 +21,8 @@ _TRIED = (3, 5)  # windows that "auto" looks at
 _WORTH = 0.05  # share of the width of some state that a window must bring to be worth its operations
 _LOOKS = 8  # steps for which "auto" asks what a window could bring
 _SETTLING = 300  # rounds of widths, at most
-_MOST_STATES = 12  # beyond, the programs of "auto" would take too long
+_MOST_STATES = 10  # beyond, the programs of "auto" would take too long
+_SMALL_STATES = 6  # up to so many all samples are taken; beyond fewer, as there are more and larger programs a sample
 
 
 def window_rows(
@@ -49,8 +50,9 @@ def window_rows(
     # On narrow boxes slopes vary less than on the region: the truth lies between the two.
     for sizes in [scaled, scaled.with_fixed_slopes()] if scaled.nonlinear else [scaled]:
         found = _worth_it(sizes, [problem.scaled_gain(N, width) for N in gains], seed)
-        if found is not None:
-            return as_window(problem, max(_TRIED), *found, width)
+        window = None if found is None else as_window(problem, max(_TRIED), *found, width)
+        if window is not None and window.length > 1:  # rows of one step only are what `gains` is for
+            return window
     return None
 
 
@@ -80,6 +82,7 @@ class _Search:
 
     def __init__(self, problem: GainProblem, length: int, gains: list[np.ndarray], seed: int):
         self.problem, self.length, self.seed = problem, length, seed
+        self.rng = np.random.default_rng(seed)
         self.rows = rows_of_gains(problem, gains, length)
         self.own = len(self.rows.parts)
         self.half = np.full(problem.n, 0.5)
@@ -89,7 +92,8 @@ class _Search:
 
     def collected(self, steps: int, rounds: int) -> list[int]:
         """Looks for rows over up to that many steps, and says which ones to keep."""
-        rng = np.random.default_rng(self.seed)
+        rng, n = self.rng, self.problem.n
+        samples = max(2, round(_SAMPLES * min(1.0, _SMALL_STATES / n) ** 2))
         self.half = _add_profile_rows(self.problem, steps, self.length, self.rows)
         if not self.rows.parts:
             return []
@@ -98,10 +102,10 @@ class _Search:
         for _ in range(rounds):
             for vertices in (True, False):
                 found = runs.of(self.rows, vertices)
-                for _ in range(_SAMPLES):
+                for _ in range(samples):
                     size, drift, *sides = found[rng.integers(len(found))]
                     s = rng.integers(RUNS)
-                    for state in range(self.problem.n):
+                    for state in range(n):
                         for sign, now in zip((-1, 1), sides, strict=True):
                             best = whole.best(state, size[s], sign * drift[s])
                             if best is not None and best[1] < now[s, state] * (1 - 1e-3):
@@ -146,12 +150,12 @@ class _Search:
 
     def settled(self, rows: Rows) -> np.ndarray:
         """Half the widths (n,) that boxes settle at or below, if they begin at the units of the problem."""
-        parts, states = np.abs(np.array(rows.parts)), np.array(rows.states)
+        parts, states = np.abs(rows.matrix()), np.array(rows.states)
         half = np.full(self.problem.n, 0.5)
         for _ in range(_SETTLING if len(parts) else 0):
             reach = parts @ sizes_of_parts(self.problem, [half] * self.length)
             least = [reach[states == i].min(initial=np.inf) for i in range(self.problem.n)]
-            half, before = np.minimum(half, least), half
+            half, before = measured(self.problem, [np.minimum(half, least)[None]] * 2, 0.0)[0][0], half
             if (before - half <= 1e-4 * before).all():
                 break
         return half
@@ -166,9 +170,9 @@ class _Search:
         return self.rows.kept([*range(self.own), *kept])
 
     def _useful(self, steps: list) -> list[int]:
-        """Row by row what helps most on these runs, beside the gains, as long as it helps. Narrow boxes count as much as
-        wide ones: in relation to the exact hull they are what is hardest."""
-        parts = np.array(self.rows.parts)
+        """Row by row what helps most on these runs, beside the gains, as long as it helps. Narrow boxes count as much
+        as wide ones: in relation to the exact hull they are what is hardest."""
+        parts = self.rows.matrix()
         size, drift = np.concatenate([step[0] for step in steps]), np.concatenate([step[1] for step in steps])
         spread, moved = size @ np.abs(parts).T, drift @ parts.T
         above, below = spread + moved, spread - moved

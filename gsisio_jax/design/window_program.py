@@ -112,8 +112,15 @@ class WindowProgram:
 
 
 def rows_of_gains(problem: GainProblem, gains: list[np.ndarray], length: int) -> Rows:
-    """What gains of one step say, as rows of a window: those that use no bounds of states and cancel free inputs."""
+    """What gains of one step say, as rows of a window: those that use no bounds of states and cancel free inputs. And
+    what outputs of one state say by themselves, which a step looks at as well."""
     P, found = problem, Rows([], [])
+    alone = [j for j in range(P.q) if np.count_nonzero(P.C[j]) == 1]
+    for j in alone:
+        gain = np.zeros((P.n, P.columns))
+        state = np.flatnonzero(P.C[j])[0]
+        gain[state, P.l + j] = 1 / P.C[j, state]
+        gains = [*gains, gain]
     older = length - 1
     b = int((~P.free).sum())
     for N in gains:
@@ -121,7 +128,7 @@ def rows_of_gains(problem: GainProblem, gains: list[np.ndarray], length: int) ->
         left = P.residual(N)
         weight = np.eye(P.n) - N_z @ P.C[: P.q]
         for i in range(P.n):
-            if N_s[i].any() or np.abs(left[i, P.free]).max(initial=0.0) > _SMALL:
+            if not N[i].any() or N_s[i].any() or np.abs(left[i, P.free]).max(initial=0.0) > _SMALL:
                 continue
             latest = [weight[i] @ P.F - N_y[i] @ P.E, weight[i], N_y[i]]
             blocks = [np.concatenate([np.zeros(older * len(part)), part]) for part in latest]
