@@ -35,7 +35,7 @@ def checked(
     system.check_unchanged("design_observer")
     for name, count, other in (("gains", gains, ' or "auto"'), ("sweeps", sweeps, "")):
         whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
-        if not (whole and count >= 1) and not (other and isinstance(count, str) and count == "auto"):
+        if not (whole and int(count) >= 1) and not (other and isinstance(count, str) and count == "auto"):
             raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1{other}, got {count!r}")
     for name, flag in (("missing", missing), ("certify", certify)):
         if not isinstance(flag, bool | np.bool_):

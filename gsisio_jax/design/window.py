@@ -155,7 +155,8 @@ class _Search:
         for _ in range(_SETTLING if len(parts) else 0):
             reach = parts @ sizes_of_parts(self.problem, [half] * self.length)
             least = [reach[states == i].min(initial=np.inf) for i in range(self.problem.n)]
-            half, before = measured(self.problem, [np.minimum(half, least)[None]] * 2, 0.0)[0][0], half
+            sides = [np.minimum(half, least)[None]] * 2
+            half, before = measured(self.problem, sides, np.zeros((1, self.problem.q)))[0][0], half
             if (before - half <= 1e-4 * before).all():
                 break
         return half

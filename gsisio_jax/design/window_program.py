@@ -115,20 +115,20 @@ def rows_of_gains(problem: GainProblem, gains: list[np.ndarray], length: int) ->
     """What gains of one step say, as rows of a window: those that use no bounds of states and cancel free inputs. And
     what outputs of one state say by themselves, which a step looks at as well."""
     P, found = problem, Rows([], [])
-    alone = [j for j in range(P.q) if np.count_nonzero(P.C[j]) == 1]
-    for j in alone:
-        gain = np.zeros((P.n, P.columns))
-        state = np.flatnonzero(P.C[j])[0]
-        gain[state, P.l + j] = 1 / P.C[j, state]
-        gains = [*gains, gain]
+    of_states = [(N, range(P.n)) for N in gains]
+    for j in range(P.q):
+        if np.count_nonzero(P.C[j]) == 1:
+            alone, state = np.zeros((P.n, P.columns)), int(np.flatnonzero(P.C[j])[0])
+            alone[state, P.l + j] = 1 / P.C[j, state]
+            of_states.append((alone, range(state, state + 1)))
     older = length - 1
     b = int((~P.free).sum())
-    for N in gains:
+    for N, states in of_states:
         N_y, N_z, N_s = P.split(N)
         left = P.residual(N)
         weight = np.eye(P.n) - N_z @ P.C[: P.q]
-        for i in range(P.n):
-            if not N[i].any() or N_s[i].any() or np.abs(left[i, P.free]).max(initial=0.0) > _SMALL:
+        for i in states:
+            if N_s[i].any() or np.abs(left[i, P.free]).max(initial=0.0) > _SMALL:
                 continue
             latest = [weight[i] @ P.F - N_y[i] @ P.E, weight[i], N_y[i]]
             blocks = [np.concatenate([np.zeros(older * len(part)), part]) for part in latest]

@@ -101,13 +101,13 @@ class Runs:
         return sizes_of_parts(P, half), np.concatenate(drift, 1)
 
 
-def measured(problem: GainProblem, sides: list[np.ndarray], noise: np.ndarray | float) -> list[np.ndarray]:
+def measured(problem: GainProblem, sides: list[np.ndarray], noise: np.ndarray) -> list[np.ndarray]:
     """Distances of the sides (S, n) once every output of T2 alone has been solved for every state, as each step does.
 
     Args:
         problem: in some units.
         sides: distances to the lower and the upper side.
-        noise: T2 v of the step, (S, q); or 0.
+        noise: T2 v of the step, (S, q).
     """
     C, below, above = problem.C[: problem.q], *(side.copy() for side in sides)
     radius = 0.5 * np.abs(problem.T2) @ problem.dv
@@ -115,8 +115,8 @@ def measured(problem: GainProblem, sides: list[np.ndarray], noise: np.ndarray | 
         others = np.where(np.arange(problem.n) == i, 0.0, C[j])
         plus, minus = np.maximum(others, 0), np.maximum(-others, 0)
         slack = radius[j] + 0.5 * (below + above) @ problem.R[j]
-        drift = noise[:, j] if np.ndim(noise) else 0.0
-        high, low = below @ plus + above @ minus + slack + drift, above @ plus + below @ minus + slack - drift
+        high = below @ plus + above @ minus + slack + noise[:, j]
+        low = above @ plus + below @ minus + slack - noise[:, j]
         high, low = (high, low) if C[j, i] > 0 else (low, high)
         above[:, i] = np.minimum(above[:, i], high / abs(C[j, i]))
         below[:, i] = np.minimum(below[:, i], low / abs(C[j, i]))
