@@ -1,4 +1,5 @@
-"""`python -m benchmarks.tightness`: widths over those of the exact hull, by window, for linear plants that are hard.
+"""`python -m benchmarks.tightness`: widths over those of the exact hull, and what they cost, by window and gains, for
+linear plants that are hard.
 
 The exact hull of x[k] takes all measurements so far into account (two linear programs a state). Widths are means over
 the last fifteen of thirty steps and over records: noise uniform and d white, then noise near its vertices (99 %, or the
@@ -8,6 +9,7 @@ hull may be a point) and d slow.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -16,10 +18,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import expm
 
 from benchmarks.__main__ import RESULTS, setting
+from benchmarks.plants import from_tests
 
 STEPS, FROM = 30, 15
 
@@ -103,23 +107,29 @@ PLANTS: dict[str, Callable[[], Plant]] = {
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.tightness", description=__doc__)
-    parser.add_argument("--windows", type=int, nargs="+", default=[1, 2, 3, 5])
+    parser.add_argument("--windows", type=_dial, nargs="+", default=[1, 2, 3, 5, "auto"])
+    parser.add_argument("--gains", type=_dial, nargs="+", default=[1])
     parser.add_argument("--records", type=int, default=3)
     parser.add_argument("--only", default="")
     options = parser.parse_args()
     table = {}
     for name, make in PLANTS.items():
         if options.only in name:
-            table[name] = measured(make(), options.windows, options.records)
+            table[name] = measured(make(), options.windows, options.gains, options.records)
             print(name)
-            for window, row in table[name].items():
-                print(f"  window {window}: " + ", ".join(f"{key} {value}" for key, value in row.items()), flush=True)
+            for dials, row in table[name].items():
+                print(f"  {dials}: " + ", ".join(f"{key} {value}" for key, value in row.items()), flush=True)
     (RESULTS / "tightness.json").write_text(json.dumps({"setting": setting(), "table": table}, indent=1) + "\n")
     return 0
 
 
-def measured(plant: Plant, windows: list[int], records: int) -> dict[int, dict[str, Any]]:
-    """Ratios of widths, rows of the window, seconds to design, microseconds a step and box, for every window."""
+def _dial(text: str) -> int | str:
+    return text if text == "auto" else int(text)
+
+
+def measured(plant: Plant, windows: list[Any], gains: list[Any], records: int) -> dict[str, dict[str, Any]]:
+    """Ratios of widths, rows of the window, operations of a step over single numbers, seconds to design, microseconds a
+    step and box, for every window and number of gains."""
     import gsisio_jax as gx
 
     ball = gx.Interval.symmetric
@@ -127,9 +137,9 @@ def measured(plant: Plant, windows: list[int], records: int) -> dict[int, dict[s
     noise = gx.Noise(ball(plant.w), ball(plant.v))
     region = gx.Interval.entire(len(plant.A))
     found = {}
-    for window in windows:
+    for window, count in itertools.product(windows, gains):
         began = time.perf_counter()
-        observer = gx.design_observer(system, noise, region, missing=False, window=window)
+        observer = gx.design_observer(system, noise, region, missing=False, window=window, gains=count)
         design = time.perf_counter() - began
         row: dict[str, Any] = {}
         for hard, label in ((False, "uniform"), (True, "vertices")):
@@ -140,11 +150,25 @@ def measured(plant: Plant, windows: list[int], records: int) -> dict[int, dict[s
                 against.append(gx.tightness(observer, ball(plant.start), y, steps=range(FROM, STEPS, 7)))
             width, hull = (np.mean([getattr(one, name) for one in against], (0, 1)) for name in ("width", "hull_width"))
             row[label] = [round(float(value), 3) for value in width / hull]
+        row["length"] = 1 if observer.window is None else observer.window.length
+        row["gains"] = len(observer.gains.residual)
         row["rows"] = 0 if observer.window is None else len(observer.window.targets)
         row["design_s"] = round(design, 2)
         row["us"] = _step_time(observer, plant)
-        found[window] = row
+        row["operations"] = _operations(observer, plant)
+        found[f"window {window}, gains {count}"] = row
     return found
+
+
+def _operations(observer: Any, plant: Plant) -> int:
+    """Operations of one step written out over single numbers, whether or not it runs so."""
+    import gsisio_jax as gx
+
+    sizes = from_tests("sizes")
+    noise = jax.tree.map(jnp.asarray, observer.noise)
+    start = jax.tree.map(jnp.asarray, gx.Interval.symmetric(plant.start))
+    first = sizes.blank(observer, start), jnp.zeros(len(plant.C)), jnp.zeros(0), noise
+    return sum(sizes.step_program(observer, first).count().values())
 
 
 def _step_time(observer: Any, plant: Plant, boxes: int = 2_000) -> float:

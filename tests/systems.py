@@ -32,7 +32,8 @@ class Case:
     sweeps: int = 1  # contractions of a step; one, as compiling takes most of the time of a test
 
     def design(self, **options: Any) -> gx.Observer:
-        options = {"sweeps": self.sweeps} | options
+        # One step, too: windows have tests of their own, and more to compile.
+        options = {"sweeps": self.sweeps, "window": 1} | options
         return gx.design_observer(self.system, self.noise, self.region, u_region=self.u_region, **options)
 
     def simulate(self, key: Any, noise: gx.Noise | None = None, d_scale: Any = 1.0) -> tuple[gx.Simulation, Any]:

@@ -202,7 +202,7 @@ SWAPPED = {
     "w and v": (design(Noise(V, W), BOX), "design_observer", "`w` must have shape (2,)", "(1,)"),
     "gains a fraction": (design(NOISE, BOX, gains=1.5), "design_observer: `gains`", "whole number", "1.5"),
     "gains a word": (design(NOISE, BOX, gains="2"), "design_observer: `gains`", "whole number", "'2'"),
-    "sweeps none": (design(NOISE, BOX, sweeps=0), "design_observer", "`sweeps` must be at least 1"),
+    "sweeps none": (design(NOISE, BOX, sweeps=0), "design_observer", "`sweeps` must be a whole number, at least 1"),
     "delay negative": (design(NOISE, BOX, delay=-1), "design_observer: `delay`", "whole number", '"auto"', "-1"),
     "delay a fraction": (design(NOISE, BOX, delay=1.0), "design_observer: `delay`", "whole number"),
     "delay a word": (design(NOISE, BOX, delay="yes"), "design_observer: `delay`", '"auto"', "'yes'"),

@@ -7,7 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from .errors import UserError, reason
 from .fields import Bounds, FileName, Number, Part, Reference, SignalName, check_box
@@ -67,14 +67,23 @@ class NoisePart(Part):
     v: Bounds
 
 
+def _count(value: Any) -> Any:
+    if value is not None and value != "auto" and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
+        raise ValueError(f'must be a whole number, at least 1, or "auto"; got {value!r}')
+    return value
+
+
+Count = Annotated[Any, BeforeValidator(_count)]  # a union of types would report every one of them that does not fit
+
+
 class DesignPart(Part):
     """Options of ``design_observer``; what is left out keeps the library's default."""
 
-    gains: Annotated[int, Field(ge=1)] | None = None
+    gains: Count = None
     missing: bool | None = None
     certify: bool | None = None
     sweeps: Annotated[int, Field(ge=1)] | None = None
-    window: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
+    window: Count = None
     split: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
     delay: Annotated[int, Field(ge=0)] | Literal["auto"] | None = None
     bounds: Annotated[list[str], Field(min_length=1)] | None = None

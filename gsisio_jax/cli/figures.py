@@ -27,8 +27,8 @@ def run_figures(
         box of this or the last one is outside of the region at ``boxes`` of them, or u of `u_region` at ``inputs``),
         ``doubt`` (text where nearly every step contradicts the bounds, else null), ``resumed`` (steps taken from an
         interrupted run), ``delay`` (L: boxes are from measurements up to L steps later), ``seconds``, ``table`` (what
-        was found in the file and is not plain), ``signals``, ``alarms`` (as in the NetCDF file, the first 10,000), ``alarm_count``, ``certificate`` (as of `certificate_figures`),
-        ``files``.
+        was found in the file and is not plain), ``signals``, ``alarms`` (as in the NetCDF file, the first 10,000),
+        ``alarm_count``, ``certificate`` (as of `certificate_figures`), ``files``.
     """
     found = outside(totals, outcome)
     signals = [

@@ -18,7 +18,7 @@ def checked(
     noise: Noise,
     region: Interval | str,
     form: str,
-    gains: int,
+    gains: int | str,
     u_region: Interval | None,
     sweeps: int,
     window: int | str,
@@ -36,22 +36,21 @@ def checked(
     if form not in ("current", "prediction"):
         raise ValueError(f'design_observer: `form` must be "current" or "prediction", got {form!r}')
     system.check_unchanged("design_observer")
-    for name, count in (("gains", gains), ("sweeps", sweeps)):
-        if isinstance(count, bool) or not isinstance(count, int | np.integer):
-            raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1, got {count!r}")
+    for name, count, other in (("gains", gains, ' or "auto"'), ("sweeps", sweeps, "")):
+        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+        if not (whole and int(count) >= 1) and not (other and isinstance(count, str) and count == "auto"):
+            raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1{other}, got {count!r}")
     if progress is not None and not isinstance(progress, bool | np.bool_):
         raise ValueError(f"design_observer: `progress` must be True, False or None, got {progress!r}")
     for name, flag in (("missing", missing), ("certify", certify)):
         if not isinstance(flag, bool | np.bool_):
             raise ValueError(f"design_observer: `{name}` must be True or False, got {flag!r}")
-    if gains < 1 or sweeps < 1:
-        raise ValueError(f"design_observer: `gains` and `sweeps` must be at least 1, got {gains} and {sweeps}")
     steps = window if isinstance(window, int | np.integer) and not isinstance(window, bool) else 0
     if window != "auto" and steps < 1:
         raise ValueError(
             f'design_observer: `window` must be a whole number of steps, at least 1, or "auto", got {window!r}'
         )
-    if window != 1 and (form == "prediction" or system.periodic_states):
+    if window not in (1, "auto") and (form == "prediction" or system.periodic_states):
         raise ValueError(
             "design_observer: `window` must be 1 in the prediction form and where states are periodic (boxes of "
             f"different steps may lie a period apart), got {window!r}"

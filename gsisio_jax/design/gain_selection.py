@@ -68,18 +68,18 @@ def profile_bank(problem: GainProblem, main: np.ndarray, region: Interval, count
 
     Smaller ones too: the intersection of a bank is narrower than the steady width of any one gain.
     """
-    if count <= 0:
-        return []
+    found = [profile_at(problem, main, region, share) for share in np.linspace(-1, 1, max(count, 0))]
+    return [gain for gain in found if gain is not None]
+
+
+def profile_at(problem: GainProblem, main: np.ndarray, region: Interval, share: float) -> np.ndarray | None:
+    """The gain for boxes of the steady width (share 0), of the region (1), of a hundredth of the steady width (-1)."""
     steady = problem.steady_width(main)
     steady = units(steady) if np.isfinite(steady).all() else typical_width(problem, region)
     width = np.asarray(region.width)
     largest = np.where(np.isfinite(width), np.maximum(width / steady, 2.0), 100.0)
-    everything = np.full(problem.columns, True)
-    found = []
-    for share in np.linspace(-1, 1, count):
-        profile = steady * np.where(share < 0, 100.0, largest) ** share
-        found.append(profile_gain(problem, profile, everything, units(profile)))
-    return [gain for gain in found if gain is not None]
+    profile = steady * np.where(share < 0, 100.0, largest) ** share
+    return profile_gain(problem, profile, np.full(problem.columns, True), units(profile))
 
 
 def gains_for_missing(

@@ -131,7 +131,7 @@ class GainProblem:
         """The same problem in units `x` of the states, (n,), and in units of the noise for the outputs."""
         y = np.where(self.dv > 0, self.dv, 1.0)
         z = np.abs(self.T2) @ y
-        zs = np.concatenate([z, x[self._bounded()]])
+        zs = np.concatenate([z, x[self.bounded_states]])
         stacked = np.vstack([self.G / x[:, None], self.H / y[:, None]])
         d = 1.0 / np.abs(stacked).max(axis=0, initial=0.0, where=np.ones_like(stacked, dtype=bool))
         return replace(
@@ -147,17 +147,31 @@ class GainProblem:
             H=self.H / y[:, None] * d,
             dw=self.dw / x,
             dv=self.dv / y,
-            ds=self.ds / x[self._bounded()],
+            ds=self.ds / x[self.bounded_states],
             dd=self.dd / d[~self.free],
         )
+
+    @property
+    def nonlinear(self) -> bool:
+        """Slopes vary."""
+        return any(radius.any() for radius in (self.F_radius, self.E_radius, self.R))
+
+    def with_fixed_slopes(self) -> GainProblem:
+        """Slopes do not vary."""
+        return replace(self, F_radius=0 * self.F_radius, E_radius=0 * self.E_radius, R=0 * self.R)
+
+    def scaled_gain(self, N: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """A gain in the units of `scaled(x)`."""
+        return N / self.unscale(np.ones_like(N), x)
 
     def unscale(self, N: np.ndarray, x: np.ndarray) -> np.ndarray:
         """A gain of `scaled(x)` in the original units."""
         y = np.where(self.dv > 0, self.dv, 1.0)
-        columns = np.concatenate([y, np.abs(self.T2) @ y, x[self._bounded()]])
+        columns = np.concatenate([y, np.abs(self.T2) @ y, x[self.bounded_states]])
         return N * x[:, None] / columns
 
-    def _bounded(self) -> np.ndarray:
+    @property
+    def bounded_states(self) -> np.ndarray:
         """Indices of the states that the pseudo-measurement rows of C stand for."""
         return self.C[self.q :].argmax(axis=1) if len(self.C) > self.q else np.zeros(0, dtype=int)
 

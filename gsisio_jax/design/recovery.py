@@ -41,7 +41,7 @@ def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_reg
     at_once = np.where(steps == 0, np.minimum(reached, bounds), bounds)
     steps, reached = (np.where(np.isfinite(bounds), now, later) for now, later in ((0.0, steps), (at_once, reached)))
     proved = bool(np.isfinite(steps).all())
-    trial = None if proved and n > _MOST_STATES else _Trial.of(observer, u_region)
+    trial = None if proved and n > _MOST_STATES else Trial.of(observer, u_region)
     if trial is None:
         lost = (_plain(steps),) if proved else ()
         return replace(
@@ -76,7 +76,7 @@ def _plain(steps: np.ndarray) -> tuple[float, ...]:
     return tuple(map(float, steps))
 
 
-class _Trial:
+class Trial:
     """A noise-free run from the centre of the region over n + 5 steps, and up to n more if it can be followed so long.
     In NumPy: a few steps take less time than the compilation of one."""
 
@@ -86,7 +86,7 @@ class _Trial:
         self.step: Any = None
 
     @classmethod
-    def of(cls, observer: Observer | DelayedObserver, u_region: Interval) -> _Trial | None:
+    def of(cls, observer: Observer | DelayedObserver, u_region: Interval) -> Trial | None:
         """None where the trajectory leaves the domain of f or g: nothing can be said for it."""
         system = observer.system
 

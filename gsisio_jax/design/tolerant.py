@@ -50,7 +50,7 @@ def check_tolerate(tolerate: Any, system: System, form: str, missing: bool, wind
     for name, legal, got in (
         ("form", '"current"', None if form == "current" else repr(form)),
         ("missing", "True (a wrong output is taken as missing)", None if missing else "False"),
-        ("window", "1 (guesses are about two measurements)", None if window == 1 else repr(window)),
+        ("window", "1 (guesses are about two measurements)", None if window in (1, "auto") else repr(window)),
         ("delay", "0 (a wrong output would be in the outputs of several steps)", None if delay == 0 else repr(delay)),
     ):
         if got is not None:

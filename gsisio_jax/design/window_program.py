@@ -10,6 +10,7 @@ from scipy import sparse
 from scipy.optimize import linprog
 
 from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.design.window_runs import Rows
 
 _SMALL = 1e-9  # multipliers below this are what a solver leaves, in units of the noise and the boxes
 
@@ -108,3 +109,29 @@ class WindowProgram:
             if np.abs(self.equal @ x + self.equal_offset[:, state]).max() > _SMALL:
                 return None
         return x
+
+
+def rows_of_gains(problem: GainProblem, gains: list[np.ndarray], length: int) -> Rows:
+    """What gains of one step say, as rows of a window: those that use no bounds of states and cancel free inputs. And
+    what outputs of one state say by themselves, which a step looks at as well."""
+    P, found = problem, Rows([], [])
+    of_states = [(N, range(P.n)) for N in gains]
+    for j in range(P.q):
+        if np.count_nonzero(P.C[j]) == 1:
+            alone, state = np.zeros((P.n, P.columns)), int(np.flatnonzero(P.C[j])[0])
+            alone[state, P.l + j] = 1 / P.C[j, state]
+            of_states.append((alone, range(state, state + 1)))
+    older = length - 1
+    b = int((~P.free).sum())
+    for N, states in of_states:
+        N_y, N_z, N_s = P.split(N)
+        left = P.residual(N)
+        weight = np.eye(P.n) - N_z @ P.C[: P.q]
+        for i in states:
+            if N_s[i].any() or np.abs(left[i, P.free]).max(initial=0.0) > _SMALL:
+                continue
+            latest = [weight[i] @ P.F - N_y[i] @ P.E, weight[i], N_y[i]]
+            blocks = [np.concatenate([np.zeros(older * len(part)), part]) for part in latest]
+            known = np.concatenate([np.zeros(older * b), left[i, ~P.free]])
+            found.add(i, np.concatenate([*blocks, N_z[i] @ P.T2, N_z[i], known]))
+    return found

@@ -36,6 +36,10 @@ class Rows:
         """Only those."""
         return Rows([self.parts[r] for r in places], [self.states[r] for r in places])
 
+    def matrix(self) -> np.ndarray:
+        """Parts of all rows, (R, k)."""
+        return np.array(self.parts).reshape(len(self.parts), -1) if self.parts else np.zeros((0, 0))
+
     def of(self, state: int) -> np.ndarray:
         return np.flatnonzero(np.array(self.states) == state)
 
@@ -53,17 +57,21 @@ class Runs:
         total = N + _STEPS
         w, v = self._noise(P.dw / 2, total, vertices), self._noise(P.dv / 2, total, vertices)
         below, above = [np.tile(self.start, (RUNS, 1))], [np.tile(self.start, (RUNS, 1))]
-        parts = np.array(rows.parts)
+        parts = rows.matrix()
         belongs = np.array(rows.states)
+        most = FAR * self.start
+        most[P.bounded_states] = P.ds / 2  # of a state in the middle of its bounds
         found = []
         for k in range(1, total):
             size, drift = self._terms(below, above, w, v, k)
-            spread, moved = size @ np.abs(parts).T, drift @ parts.T
+            none = np.zeros((RUNS, 0))
+            spread, moved = (size @ np.abs(parts).T, drift @ parts.T) if len(parts) else (none, none)
             sides = []
             for sign in (-1, 1):
                 reach = spread + sign * moved
                 best = [reach[:, belongs == i].min(1, initial=np.inf) for i in range(n)]
-                sides.append(np.minimum(np.stack(best, 1), FAR * self.start))
+                sides.append(np.minimum(np.stack(best, 1), most))
+            sides = measured(P, sides, v[:, k] @ P.T2.T)
             below.append(sides[0])
             above.append(sides[1])
             if k > N + 3:
@@ -91,6 +99,28 @@ class Runs:
             np.zeros((RUNS, P.q + N * len(P.dd))),
         ]
         return sizes_of_parts(P, half), np.concatenate(drift, 1)
+
+
+def measured(problem: GainProblem, sides: list[np.ndarray], noise: np.ndarray) -> list[np.ndarray]:
+    """Distances of the sides (S, n) once every output of T2 alone has been solved for every state, as each step does.
+
+    Args:
+        problem: in some units.
+        sides: distances to the lower and the upper side.
+        noise: T2 v of the step, (S, q).
+    """
+    C, below, above = problem.C[: problem.q], *(side.copy() for side in sides)
+    radius = 0.5 * np.abs(problem.T2) @ problem.dv
+    for j, i in np.argwhere(C):
+        others = np.where(np.arange(problem.n) == i, 0.0, C[j])
+        plus, minus = np.maximum(others, 0), np.maximum(-others, 0)
+        slack = radius[j] + 0.5 * (below + above) @ problem.R[j]
+        high = below @ plus + above @ minus + slack + noise[:, j]
+        low = above @ plus + below @ minus + slack - noise[:, j]
+        high, low = (high, low) if C[j, i] > 0 else (low, high)
+        above[:, i] = np.minimum(above[:, i], high / abs(C[j, i]))
+        below[:, i] = np.minimum(below[:, i], low / abs(C[j, i]))
+    return [below, above]
 
 
 def sizes_of_parts(problem: GainProblem, half: list[np.ndarray]) -> np.ndarray:

@@ -66,7 +66,8 @@ CASES = {
     "same file": ('"boxes.csv"', '"cart.nc"', ["outputs: netcdf, csv, picture and report must be different files"]),
     "syntax": ("[noise]", "[noise", ["cart.toml: not valid TOML", "line 8"]),
     "conflict rule": ("[outputs]", "[estimate]\non_conflict = 'stop'\n[outputs]", ["estimate.on_conflict", "'stop'"]),
-    "gains": ("sweeps = 1", "gains = 0", ["design.gains must be greater than or equal to 1"]),
+    "gains": ("sweeps = 1", "gains = 0", ['design.gains: must be a whole number, at least 1, or "auto"; got 0']),
+    "window": ("sweeps = 1", 'window = "long"', ["design.window: must be a whole number, at least 1", "'long'"]),
     "clock": (
         'time = "t"',
         "time = 3",

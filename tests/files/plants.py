@@ -83,7 +83,7 @@ def design(kind):
         case "planes":
             return systems.s1().design(missing=False, bounds=("affine", "abstraction"))
         case "bounded":
-            return gx.design_observer(plant, NOISE, Interval([0.1, -2.0], [4.0, 2.0]), u_region=ball(1.0))
+            return gx.design_observer(plant, NOISE, Interval([0.1, -2.0], [4.0, 2.0]), u_region=ball(1.0), window=1)
         case "turning":
             return gx.design_observer(plant, NOISE, everywhere, sweeps=1)
         case "prediction":

@@ -161,7 +161,7 @@ KNOWN_NOISE = gx.Noise(Interval([-0.05, 0.0], [0.05, 0.1]), Interval([-0.1, -0.2
 def known():
     u_region = Interval([-0.3, -1.0], [0.3, 1.0])
     observer = gx.design_observer(
-        KNOWN, KNOWN_NOISE, Interval.symmetric([3.0, 3.0]), missing=False, sweeps=1, u_region=u_region
+        KNOWN, KNOWN_NOISE, Interval.symmetric([3.0, 3.0]), missing=False, sweeps=1, u_region=u_region, window=1
     )
     return observer.with_rounding("nearest")  # less to compile
 

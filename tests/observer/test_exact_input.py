@@ -38,7 +38,7 @@ def explained(observer, lower, upper):
 def test_exact_for_boxes_of_every_kind(bound):
     known = None if bound is None else Interval([-np.inf, -bound], [np.inf, bound])
     system, noise = plant(known)
-    observer = gx.design_observer(system, noise, Interval.entire(3), missing=False, sweeps=1)
+    observer = gx.design_observer(system, noise, Interval.entire(3), missing=False, sweeps=1, window=1)
     assert observer.exact.complete
     S = np.vstack([system.G, system.H])
     random = np.random.default_rng(2)
@@ -69,7 +69,7 @@ def test_rows_that_say_the_same_may_contradict_each_other():
     """No two bounds of d need to cross for that: every one of them also stands on a row that says next to nothing."""
     system = gx.System(lambda x: 0.5 * x, lambda x: x, G=[[1.0, 1.0], [2.0, 2.0]], H=[[1.0, 0.0], [0.0, 0.0]])
     noise = gx.Noise(systems.ball([0.1, 0.1]), systems.ball([0.1, 0.1]))
-    observer = gx.design_observer(system, noise, Interval.entire(2), missing=False, sweeps=1)
+    observer = gx.design_observer(system, noise, Interval.entire(2), missing=False, sweeps=1, window=1)
     for second, possible in ((1.0, True), (6.0, False)):
         lower = np.array([0.0, second, -100.0, -100.0])
         box, conflict = explained(observer, lower, np.array([1.0, second + 1, 100.0, 100.0]))
@@ -80,7 +80,7 @@ def test_rows_that_say_the_same_may_contradict_each_other():
 def test_boxes_of_a_run_are_no_wider_than_the_linear_program():
     """From the observer's own state boxes; joint bounds can only make them smaller."""
     system, noise = plant()
-    observer = gx.design_observer(system, noise, Interval.entire(3), missing=False, sweeps=1)
+    observer = gx.design_observer(system, noise, Interval.entire(3), missing=False, sweeps=1, window=1)
     d = 2 * np.random.default_rng(3).standard_normal((12, 2))
     sim = gx.simulate(system, jax.random.key(0), np.zeros(3), d, noise)
     estimate = gx.estimate(observer, systems.ball([0.5] * 3), sim.y)

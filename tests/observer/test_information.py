@@ -45,7 +45,7 @@ def widths(make, known, y=None):
     """Widths (T, n) of the boxes, and the record they are made from."""
     system, region, initial, x0, v = make(**known)
     noise = gx.Noise(ball(1e-6, 1e-6), Interval.symmetric([v] * system.l))
-    observer = gx.design_observer(system, noise, region, missing=False, certify=False)
+    observer = gx.design_observer(system, noise, region, missing=False, certify=False, window=1)
     if y is None:
         d = 0.5 * np.sin(0.2 * np.arange(STEPS))[:, None] * np.ones((1, system.p))
         y = gx.simulate(system, jax.random.key(0), x0, d, noise).y

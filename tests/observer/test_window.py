@@ -170,7 +170,7 @@ def test_auto_takes_a_window_only_where_it_is_worth_it(w, worth):
     """Where noise moves the state farther than its measurement errs, what was known of it before is worth nothing."""
     system = gx.System(lambda x: TURN @ x, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)))
     noise = gx.Noise(Interval.symmetric(w), NOISE.v)
-    observer = gx.design_observer(system, noise, Interval.symmetric([5.0, 5.0]), missing=False, window="auto")
+    observer = gx.design_observer(system, noise, Interval.symmetric([5.0, 5.0]), missing=False)
     assert (observer.window is not None) == worth
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from plants import LINEAR, linear_observer
 from soak import forms, observers, primitives, sums
 
 pytestmark = pytest.mark.soak
@@ -27,6 +28,15 @@ def test_forms_made_of_others(dtype):
 def test_ten_million_observer_steps(dtype):
     found = observers(dtype, 1e7, 100)
     print("\n", found)
+    assert (found["misses"], found["conflicts"]) == (0, 0), found["plants"]
+
+
+@DTYPES
+def test_a_million_steps_with_windows(dtype):
+    """The same plants; that their rows look back over several steps is what is added."""
+    windows = [linear_observer(name, dtype).window for name in LINEAR if name != "no unknown input"]
+    assert all(window.length == 3 for window in windows)
+    found = observers(dtype, 1e6, 300)
     assert (found["misses"], found["conflicts"]) == (0, 0), found["plants"]
 
 

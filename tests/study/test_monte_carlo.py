@@ -39,7 +39,7 @@ def manoeuvre(key, k, x):
 @pytest.fixture(scope="module")
 def observer():
     noise = gx.Noise(systems.ball([0.1, 0.1]), systems.ball([0.1, 0.1]))
-    found = gx.design_observer(PLANT, noise, systems.ball([3.0, 3.0]), missing=False, sweeps=1)
+    found = gx.design_observer(PLANT, noise, systems.ball([3.0, 3.0]), missing=False, sweeps=1, window=1)
     return found.with_rounding("nearest")  # less to compile
 
 

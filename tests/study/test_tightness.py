@@ -21,7 +21,7 @@ OFFSET, SHIFT = np.array([0.1, -0.2, 0.3]), np.array([0, 1.0, 0, -2.0, 0])
 W, V, START = np.full(3, 0.02), np.full(5, 0.1), np.full(3, 2.0)
 STEPS = 14
 FADING = np.linspace(1, 0.5, STEPS)[:, None]  # the noise bounds over time
-FAST = {"missing": False, "sweeps": 1}
+FAST = {"missing": False, "sweeps": 1, "window": 1}
 
 
 class Record:

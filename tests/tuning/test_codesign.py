@@ -119,7 +119,7 @@ def bought() -> Allocation:
         lambda x: jnp.asarray(A) @ x, lambda x: jnp.asarray(C) @ x, G=np.zeros((2, 0)), H=np.zeros((2, 0))
     )
     noise = gx.Noise(gx.Interval.symmetric([W, W]), gx.Interval.symmetric([0.1, 0.1]))
-    return gx.allocate(system, noise, gx.Interval.entire(2), REQUIRED, {"v": PRICE}, missing=False)
+    return gx.allocate(system, noise, gx.Interval.entire(2), REQUIRED, {"v": PRICE}, missing=False, window=1)
 
 
 def test_allocate_meets_the_requirement_when_designed_afresh(bought):

@@ -1,0 +1,61 @@
+"""What a design chooses where nothing is said: the window; and how far ``gains="auto"`` goes. Nothing is compiled."""
+
+import numpy as np
+import pytest
+import systems
+
+import gsisio_jax as gx
+from gsisio_jax import Interval
+from gsisio_jax.design.gain_growth import grown
+
+AUTO = {"missing": False, "window": "auto"}
+
+
+def test_no_window_where_the_measurements_say_nothing_twice():
+    """The example of the paper has as many unknown inputs as outputs: one step is exact for fixed slopes."""
+    assert systems.s1().design(**AUTO).window is None
+
+
+def test_a_window_where_boxes_shrink_slowly():
+    """A step of the four tanks gains under one per cent, forty per cent in the end."""
+    window = systems.s7().design(**AUTO).window
+    assert window is not None
+    assert window.length > 1
+
+
+def test_the_default_looks_for_a_window():
+    turn = 0.95 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    system = gx.System(lambda x: turn @ x, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)))
+    noise = gx.Noise(Interval.symmetric([0.02, 0.02]), Interval.symmetric([0.05, 2.0]))
+    default = gx.design_observer(system, noise, Interval.entire(2), missing=False)
+    one = gx.design_observer(system, noise, Interval.entire(2), missing=False, window=1)
+    assert default.window is not None
+    assert default.certificate.steady_width[1] < 0.8 * one.certificate.steady_width[1]
+
+
+@pytest.mark.parametrize(("shares", "count"), [([0.5, 0.2, 0.1, 0.004, 0.5], 4), ([0.009], 1), ([], 1)])
+def test_the_bank_grows_until_a_gain_brings_under_one_per_cent(shares, count):
+    """Gain k narrows the first state by shares[k]; the second one never changes."""
+    gains = iter(np.full((1, 1), k + 1.0) for k in range(len(shares)))
+
+    def widths(bank):
+        return np.tile([np.prod([1 - share for share in shares[: len(bank) - 1]]), 1.0], (3, 1))
+
+    bank = grown([np.zeros((1, 1))], lambda share: next(gains, None), widths)
+    assert [gain.item() for gain in bank] == list(range(count))
+
+
+def test_it_does_not_grow_where_no_run_can_be_had():
+    bank = [np.zeros((1, 1))]
+    assert grown(bank, lambda share: np.ones((1, 1)), lambda gains: None) == bank
+
+
+def test_automatic_gains_are_fewer_than_all_and_narrow_the_first_boxes():
+    observer = systems.s1().design(missing=False, gains="auto")
+    assert 1 < len(observer.gains.residual) < 8
+
+
+@pytest.mark.parametrize("gains", ["all", 0, 1.5, True])
+def test_gains_that_cannot_be(gains):
+    with pytest.raises(ValueError, match=r'`gains` must be a whole number, at least 1 or "auto", got'):
+        systems.s1().design(gains=gains)
