@@ -2,54 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any, Literal, overload
 
-import numpy as np
-
 from gsisio_jax.design.arguments import check_cells, checked
-from gsisio_jax.design.assemble import Plan, assemble
-from gsisio_jax.design.dead_beat import dead_beat_rows
-from gsisio_jax.design.delay import check_delay, design_delayed, with_delay
-from gsisio_jax.design.existence import check_existence
-from gsisio_jax.design.feedthrough import factorise
-from gsisio_jax.design.first_gain import first_gain
-from gsisio_jax.design.gain_growth import grown, widths_of_run
-from gsisio_jax.design.gain_selection import (
-    distinct,
-    gains_for_missing,
-    gains_without_state_bounds,
-    profile_at,
-    profile_bank,
-    typical_width,
-    units,
-)
-from gsisio_jax.design.gains import optimal_gain
-from gsisio_jax.design.gains_with_less import gains_with_less
-from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
-from gsisio_jax.design.initial_contraction import check_initial_contraction
-from gsisio_jax.design.inputs import input_bounds
+from gsisio_jax.design.current import Dials, design_current
+from gsisio_jax.design.delay import check_delay, design_delayed
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
-from gsisio_jax.design.progress import Say, told
-from gsisio_jax.design.recovery import with_recovery
-from gsisio_jax.design.region import Around, find_region, grown_around, read_around
-from gsisio_jax.design.slices import check_split, with_slices
-from gsisio_jax.design.tolerant import Guessed, check_tolerate, tolerant
-from gsisio_jax.design.undefined import undefined_in
-from gsisio_jax.design.window import window_rows
-from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
+from gsisio_jax.design.progress import told
+from gsisio_jax.design.region import Around, read_around
+from gsisio_jax.design.slices import check_split
+from gsisio_jax.design.tolerant import check_tolerate
 from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer.cells import counts
 from gsisio_jax.observer.delayed import DelayedObserver
-from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
 from gsisio_jax.observer.prediction_step import PredictionObserver
-from gsisio_jax.observer.recovery_constants import AffineMaps
-from gsisio_jax.observer.rounding_constants import with_rounding_constants
 from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.observer.types import Observer
-from gsisio_jax.observer.window_widths import WindowWidths
 from gsisio_jax.plant.system import Noise, System
 
 
@@ -234,6 +203,7 @@ def design_observer(
     late = check_delay(delay, system, form)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS
     methods = check_methods("design_observer", default if bounds is None else bounds)
+    dials = Dials(gains, missing, sweeps, methods, certify, window, cells, split, tolerate)
     with told("design_observer", progress) as say:
         if form == "prediction":
             return design_prediction(
@@ -241,143 +211,6 @@ def design_observer(
             )
 
         def design(plant: System, noise: Noise, quick: bool) -> Observer:
-            return _design(
-                plant, noise, given, near, 1 if quick else gains, u_region, missing and not quick, sweeps, methods,
-                certify and not quick, 1 if quick else window, 1 if quick else cells, 1 if quick else split,
-                tolerate, say,
-            )  # fmt: skip
+            return design_current(plant, noise, given, near, u_region, dials.quick() if quick else dials, say)
 
         return design_delayed(design, system, noise, given, u_region, delay) if late else design(system, noise, False)
-
-
-def _design(
-    system: System,
-    noise: Noise,
-    given: Interval | None,
-    near: Interval | None,
-    gains: int | Literal["auto"],
-    u_region: Interval,
-    missing: bool,
-    sweeps: int,
-    methods: tuple[str, ...],
-    certify: bool,
-    window: int | Literal["auto"],
-    cells: int,
-    split: int | Literal["auto"],
-    tolerate: int,
-    say: Say,
-) -> Any:
-    """The current form, its arguments checked; `given` is the region, or None and it is looked for around `near`."""
-    say("bounding slopes")
-    feedthrough = factorise(np.asarray(system.H))
-    slopes_on = slopes_of(system, feedthrough.T2, u_region)
-    everywhere = slopes_on(system.state_bounds)
-    try:
-        check_existence(system, feedthrough, everywhere)
-    except ObserverDoesNotExist as error:
-        say("looking for what would help")
-        reason = with_delay(error, system, u_region)
-        ways = what_helps(Plan(system, noise, feedthrough, u_region), slopes_on, near if given is None else given)
-        raise type(reason)(f"{reason}{ways}") from None
-    plan = Plan(system, noise, feedthrough, u_region)
-    say("looking for a region")
-    box = _found_region(plan, slopes_on, certify, near) if given is None else given
-    say("choosing gains")
-    first = first_gain(plan, slopes_on, box, certify)
-    problem, main = first.problem, first.gain
-    say("bounding unknown inputs")
-    maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
-    outputs, slack = first_form(system, feedthrough.T2, u_region)
-
-    def assembled(gains: list[np.ndarray], scale: np.ndarray) -> Observer:
-        inputs = input_bounds(problem, scale)
-        return assemble(plan, problem, box, gains, inputs, everywhere.affine, methods, sweeps)
-
-    def finished(observer: Observer) -> Observer:
-        slices = observer.certificate.slices
-        return with_rounding_constants(
-            observer, system, first.slopes, everywhere, outputs, slack, maps, np.float64, slices
-        )  # fmt: skip
-
-    steady = problem.steady_width(main)
-    width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
-    if gains == "auto":
-        bank = grown(
-            [main],
-            lambda share: profile_at(problem, main, box, share),
-            lambda gains: widths_of_run(finished(assembled(gains, width)), box, width, u_region),
-        )
-    else:
-        bank = [main, *profile_bank(problem, main, box, gains - 1)]
-    if missing or system.periodic:  # the multiple of a periodic output is chosen without that output
-        bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
-    guessed = Guessed(problem, main, box, feedthrough, tolerate) if tolerate else None
-    if guessed is not None:
-        bank.extend(guessed.gains())
-    bank = distinct([*bank, *gains_without_state_bounds(problem, main, box)])
-    bank = distinct([*bank, *gains_with_less(problem, bank, box)])
-    observer = assembled(bank, width)
-    if first.uncertified:
-        observer = replace(observer, certificate=observer.certificate.without_promise(first.uncertified))
-    elif split != 1 and not everywhere.affine:
-        weights = np.asarray(observer.gains.residual[0])
-        certificate = with_slices(observer.certificate, noise, weights, slopes_on, box, split)
-        observer = replace(observer, certificate=certificate)
-    observer = replace(observer, cells=counts(cells, everywhere.bent_outputs))
-    if not (first.uncertified or observer.certificate.certified):
-        way = what_settles(plan, slopes_on, box)
-        observer = replace(observer, certificate=observer.certificate.with_notes(way))
-    if not everywhere.affine:
-        found = (undefined_in(system, box, u_region), grown_around(near, box) if given is None else "")
-        observer = replace(observer, certificate=observer.certificate.with_notes(*found))
-    chosen = window == "auto"
-    if not tolerate and window != 1 and (not chosen or (first.slopes.finite and not system.periodic_states)):
-        say("choosing rows over several steps")
-        rows = window_rows(problem, window, width, bank)
-        observer = replace(observer, window=rows)
-        if rows is not None and everywhere.affine:
-            widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
-            observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
-    if maps is not None:
-        rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
-        observer = replace(observer, recovery=rows_alone)
-    say("bounding what rounding leaves")
-    observer = finished(observer)
-    if certify:
-        try:
-            check_initial_contraction(problem, bank[0], observer, outputs)
-        except NoDesignFound as error:
-            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, box)}") from None
-    if tolerate:
-        return tolerant(observer, tolerate)
-    if not missing:
-        return observer
-    say("trying what happens after a lost row")
-    certificate = with_recovery(observer, width, u_region)
-    if certificate.recoverable is False:
-        certificate = certificate.with_notes(what_recovers(plan, slopes_on, box))
-    return replace(observer, certificate=certificate)
-
-
-def _found_region(
-    plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool, near: Interval | None
-) -> Interval:
-    """region="auto"; where there is none and no certificate is asked for, the point that the search began at."""
-    try:
-        return find_region(plan.system, lambda box: _steady_width(plan, box, slopes_on(box)), near)
-    except NoDesignFound as error:
-        if certify:
-            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, near)}") from None
-        if near is not None:
-            return near
-        center = np.asarray(plan.system.state_bounds.center, np.float64)
-        return Interval(center, center)
-
-
-def _steady_width(plan: Plan, region: Interval, slopes: Slopes) -> np.ndarray:
-    """Steady width of the optimal gain on a region; infinite where there is none. Serves region='auto'."""
-    if not slopes.finite:
-        return np.full(plan.system.n, np.inf)
-    problem = plan.problem(slopes)
-    gain = optimal_gain(problem, np.ones(problem.n), typical_width(problem, region))
-    return np.full(problem.n, np.inf) if gain is None else problem.steady_width(gain)

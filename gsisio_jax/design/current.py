@@ -1,0 +1,192 @@
+"""The current form: from slopes on a region to gains, rows and rounding constants, and what they promise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from gsisio_jax.design.assemble import Plan, assemble
+from gsisio_jax.design.dead_beat import dead_beat_rows
+from gsisio_jax.design.delay import with_delay
+from gsisio_jax.design.existence import check_existence
+from gsisio_jax.design.feedthrough import factorise
+from gsisio_jax.design.first_gain import first_gain
+from gsisio_jax.design.gain_growth import grown, widths_of_run
+from gsisio_jax.design.gain_selection import (
+    distinct,
+    gains_for_missing,
+    gains_without_state_bounds,
+    profile_at,
+    profile_bank,
+    typical_width,
+    units,
+)
+from gsisio_jax.design.gains import optimal_gain
+from gsisio_jax.design.gains_with_less import gains_with_less
+from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
+from gsisio_jax.design.initial_contraction import check_initial_contraction
+from gsisio_jax.design.inputs import input_bounds
+from gsisio_jax.design.progress import Say
+from gsisio_jax.design.recovery import with_recovery
+from gsisio_jax.design.region import find_region, grown_around
+from gsisio_jax.design.slices import with_slices
+from gsisio_jax.design.tolerant import Guessed, tolerant
+from gsisio_jax.design.undefined import undefined_in
+from gsisio_jax.design.window import window_rows
+from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
+from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.cells import counts
+from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
+from gsisio_jax.observer.recovery_constants import AffineMaps
+from gsisio_jax.observer.rounding_constants import with_rounding_constants
+from gsisio_jax.observer.types import Observer
+from gsisio_jax.observer.window_widths import WindowWidths
+from gsisio_jax.plant.system import Noise, System
+
+
+class Dials(NamedTuple):
+    """Options of `design_observer` in the current form, as they stand there."""
+
+    gains: int | Literal["auto"]
+    missing: bool
+    sweeps: int
+    methods: tuple[str, ...]
+    certify: bool
+    window: int | Literal["auto"]
+    cells: int
+    split: int | Literal["auto"]
+    tolerate: int
+
+    def quick(self) -> Dials:
+        """For a design that is tried only."""
+        return self._replace(gains=1, missing=False, certify=False, window=1, cells=1, split=1)
+
+
+def design_current(
+    system: System,
+    noise: Noise,
+    given: Interval | None,
+    near: Interval | None,
+    u_region: Interval,
+    dials: Dials,
+    say: Say,
+) -> Any:
+    """The current form, its arguments checked; `given` is the region, or None and it is looked for around `near`."""
+    say("bounding slopes")
+    feedthrough = factorise(np.asarray(system.H))
+    slopes_on = slopes_of(system, feedthrough.T2, u_region)
+    everywhere = slopes_on(system.state_bounds)
+    try:
+        check_existence(system, feedthrough, everywhere)
+    except ObserverDoesNotExist as error:
+        say("looking for what would help")
+        reason = with_delay(error, system, u_region)
+        ways = what_helps(Plan(system, noise, feedthrough, u_region), slopes_on, near if given is None else given)
+        raise type(reason)(f"{reason}{ways}") from None
+    plan = Plan(system, noise, feedthrough, u_region)
+    say("looking for a region")
+    box = _found_region(plan, slopes_on, dials.certify, near) if given is None else given
+    say("choosing gains")
+    first = first_gain(plan, slopes_on, box, dials.certify)
+    problem, main = first.problem, first.gain
+    say("bounding unknown inputs")
+    maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
+    outputs, slack = first_form(system, feedthrough.T2, u_region)
+
+    def assembled(gains: list[np.ndarray], scale: np.ndarray) -> Observer:
+        inputs = input_bounds(problem, scale)
+        return assemble(plan, problem, box, gains, inputs, everywhere.affine, dials.methods, dials.sweeps)
+
+    def finished(observer: Observer) -> Observer:
+        slices = observer.certificate.slices
+        return with_rounding_constants(
+            observer, system, first.slopes, everywhere, outputs, slack, maps, np.float64, slices
+        )  # fmt: skip
+
+    steady = problem.steady_width(main)
+    width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
+    if dials.gains == "auto":
+        bank = grown(
+            [main],
+            lambda share: profile_at(problem, main, box, share),
+            lambda gains: widths_of_run(finished(assembled(gains, width)), box, width, u_region),
+        )
+    else:
+        bank = [main, *profile_bank(problem, main, box, dials.gains - 1)]
+    if dials.missing or system.periodic:  # the multiple of a periodic output is chosen without that output
+        bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
+    guessed = Guessed(problem, main, box, feedthrough, dials.tolerate) if dials.tolerate else None
+    if guessed is not None:
+        bank.extend(guessed.gains())
+    bank = distinct([*bank, *gains_without_state_bounds(problem, main, box)])
+    bank = distinct([*bank, *gains_with_less(problem, bank, box)])
+    observer = assembled(bank, width)
+    if first.uncertified:
+        observer = replace(observer, certificate=observer.certificate.without_promise(first.uncertified))
+    elif dials.split != 1 and not everywhere.affine:
+        weights = np.asarray(observer.gains.residual[0])
+        certificate = with_slices(observer.certificate, noise, weights, slopes_on, box, dials.split)
+        observer = replace(observer, certificate=certificate)
+    observer = replace(observer, cells=counts(dials.cells, everywhere.bent_outputs))
+    if not (first.uncertified or observer.certificate.certified):
+        way = what_settles(plan, slopes_on, box)
+        observer = replace(observer, certificate=observer.certificate.with_notes(way))
+    if not everywhere.affine:
+        found = (undefined_in(system, box, u_region), grown_around(near, box) if given is None else "")
+        observer = replace(observer, certificate=observer.certificate.with_notes(*found))
+    window = 1 if dials.tolerate else dials.window
+    if window == "auto" and not (first.slopes.finite and not system.periodic_states):
+        window = 1
+    if window != 1:
+        say("choosing rows over several steps")
+        rows = window_rows(problem, window, width, bank)
+        observer = replace(observer, window=rows)
+        if rows is not None and everywhere.affine:
+            widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
+            observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
+    if maps is not None:
+        rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
+        observer = replace(observer, recovery=rows_alone)
+    say("bounding what rounding leaves")
+    observer = finished(observer)
+    if dials.certify:
+        try:
+            check_initial_contraction(problem, bank[0], observer, outputs)
+        except NoDesignFound as error:
+            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, box)}") from None
+    if dials.tolerate:
+        return tolerant(observer, dials.tolerate)
+    if not dials.missing:
+        return observer
+    say("trying what happens after a lost row")
+    certificate = with_recovery(observer, width, u_region)
+    if certificate.recoverable is False:
+        certificate = certificate.with_notes(what_recovers(plan, slopes_on, box))
+    return replace(observer, certificate=certificate)
+
+
+def _found_region(
+    plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool, near: Interval | None
+) -> Interval:
+    """region="auto"; where there is none and no certificate is asked for, the point that the search began at."""
+    try:
+        return find_region(plan.system, lambda box: _steady_width(plan, box, slopes_on(box)), near)
+    except NoDesignFound as error:
+        if certify:
+            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, near)}") from None
+        if near is not None:
+            return near
+        center = np.asarray(plan.system.state_bounds.center, np.float64)
+        return Interval(center, center)
+
+
+def _steady_width(plan: Plan, region: Interval, slopes: Slopes) -> np.ndarray:
+    """Steady width of the optimal gain on a region; infinite where there is none. Serves region='auto'."""
+    if not slopes.finite:
+        return np.full(plan.system.n, np.inf)
+    problem = plan.problem(slopes)
+    gain = optimal_gain(problem, np.ones(problem.n), typical_width(problem, region))
+    return np.full(problem.n, np.inf) if gain is None else problem.steady_width(gain)
