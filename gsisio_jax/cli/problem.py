@@ -179,7 +179,8 @@ def _with_periods(system: Any, config: Config, groups: dict[str, Names], file: s
     try:
         return System(
             system.f, system.g, system.G, system.H, system.B, system.D, system.state_bounds, system.input_bounds,
-            system.m, periodic=outputs, periodic_states=states,
+            system.m, periodic=outputs, periodic_states=states, input_rate=system.input_rate,
+            input_constant=system.input_constant,
         )  # fmt: skip
     except ValueError as error:
         raise UserError(f"{file}: system: {reason(error)}") from error

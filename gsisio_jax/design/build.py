@@ -25,6 +25,7 @@ from gsisio_jax.design.gain_selection import (
 )
 from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.initial_contraction import check_initial_contraction
+from gsisio_jax.design.input_rows import rows_of_inputs
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
 from gsisio_jax.design.recovery import with_recovery
@@ -206,6 +207,7 @@ def design_observer(
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
+    observer = replace(observer, input_rows=rows_of_inputs(problem, system, window, width))
     maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
     if maps is not None:
         observer = replace(observer, recovery=dead_beat_rows(problem, maps, width))

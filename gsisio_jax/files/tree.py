@@ -31,7 +31,7 @@ def _classes() -> dict[str, type]:
     from gsisio_jax.inclusion.atoms import AtomBounds
     from gsisio_jax.inclusion.planes import Abstraction
     from gsisio_jax.interval.box import Interval
-    from gsisio_jax.observer import bank, past, recovery, types, window, window_widths
+    from gsisio_jax.observer import bank, input_memory, past, recovery, types, window, window_widths
     from gsisio_jax.observer.certificate import Certificate
     from gsisio_jax.observer.delayed import DelayedObserver, Waiting
     from gsisio_jax.observer.prediction_step import PredictionObserver
@@ -42,7 +42,7 @@ def _classes() -> dict[str, type]:
         Waiting,
         bank.CancellationResidual, bank.LinearBounds, types.Carry, types.ExactInputs, types.InitialContraction,
         types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, window.Window,
-        window_widths.WindowWidths,
+        window_widths.WindowWidths, input_memory.InputMemory, input_memory.InputRows,
     )  # fmt: skip
     return {kind.__name__: kind for kind in found}
 

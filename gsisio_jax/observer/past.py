@@ -75,11 +75,11 @@ def known(observer: Any, past: Past, terms: int) -> Interval:
 
 def _depth(observer: Any) -> int:
     """How many steps back the rows of an observer look."""
-    return max((rows.length for rows in (observer.window, observer.recovery) if rows is not None), default=1)
+    return max((rows.length for rows in (observer.window, observer.recovery, observer.input_rows) if rows is not None), default=1)
 
 
 def _as_needed(pasts: tuple[Past, ...], observer: Any) -> tuple[Past, ...]:
-    whole = 0 if observer.window is None else observer.window.length - 1
+    whole = max((rows.length - 1 for rows in (observer.window, observer.input_rows) if rows is not None), default=0)
     return (*pasts[:whole], *(past.without_boxes() for past in pasts[whole:]))
 
 

@@ -23,6 +23,7 @@ from gsisio_jax.observer.recovery_constants import AffineMaps, with_constants
 from gsisio_jax.observer.residuals import (
     cancellation_residual,
     exact,
+    input_row_residual,
     nearest_feedthrough,
     rounded_up,
     row_cancellation_residual,
@@ -140,6 +141,10 @@ def with_rounding_constants(
     if window is not None:
         left_x, left_d = window_residual(window, system, wide.C, wide.bounded_inputs, H_slack)
         window = _cast_window(window, left_x, left_d, wide.T2, dtype)
+    input_rows = wide.input_rows
+    if input_rows is not None:
+        left_d = _cast(input_row_residual(input_rows, system, H_slack), dtype)
+        input_rows = replace(jax.tree.map(lambda x: np.asarray(x, dtype), input_rows), left=left_d)
     recovery = None if affine is None else _recovery(wide, system, affine, H_slack, dtype)
     first = InitialContraction(
         form=None if system.g_takes_u else jax.tree.map(lambda x: np.asarray(x, dtype), form),
@@ -164,6 +169,7 @@ def with_rounding_constants(
         region_inverse=_cast(inverse, dtype),
         window=window,
         recovery=recovery,
+        input_rows=input_rows,
         corrections=_corrections(spectral_radius(implicit)) if certificate.promised else 0,
         certificate=certificate,
     )
