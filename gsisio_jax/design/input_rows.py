@@ -16,7 +16,7 @@ from gsisio_jax.design.window_runs import FAR, Rows
 from gsisio_jax.observer.input_memory import InputRows
 from gsisio_jax.plant.system import System
 
-_RATE_STEPS, _BLOCK_STEPS = 8, 12  # how far rows look back where `window` does not say more
+_STEPS = 16  # how far rows look back where `window` does not say more
 _SAMPLES, _TESTED = 12, 100  # samples that exact rows are asked for, and that rows are chosen on
 _MOST_ROWS, _LEAST_GAIN = 16, 5e-3  # of an input, and share of the width that one more row must bring
 
@@ -34,16 +34,13 @@ def rows_of_inputs(problem: GainProblem, system: System, window: int | str, widt
         None where no row exists.
     """
     scaled, unit = problem.scaled(width), _units(problem, width)
-    p = len(unit)
-    rate = np.full(p, np.inf)
-    if system.input_rate is not None:
-        rate = np.asarray(system.input_rate.width, np.float64) / 2 / unit
+    p, rate = len(unit), _rate(system) / unit
     least = window if isinstance(window, int) else 1
     profiles = []
     if system.input_constant is not None:
-        profiles.append((np.zeros(p), max(2, min(system.input_constant, max(_BLOCK_STEPS, least)))))
+        profiles.append((np.zeros(p), max(2, min(system.input_constant, max(_STEPS, least)))))
     if np.isfinite(rate).any():
-        profiles.append((rate, max(_RATE_STEPS, least)))
+        profiles.append((rate, max(_STEPS, least)))
     length = max((steps for _, steps in profiles), default=0)
     found, kept = Rows([], []), []
     for move, steps in profiles:
@@ -60,14 +57,35 @@ def rows_of_inputs(problem: GainProblem, system: System, window: int | str, widt
     return _as_rows(problem, length, found, kept, width, unit) if kept else None
 
 
+def rows_of_sums(problem: GainProblem, system: System, steps: int, width: np.ndarray) -> InputRows | None:
+    """Rows for the sum of each input over the last `steps` steps; arguments and result as `rows_of_inputs`."""
+    scaled, unit = problem.scaled(width), _units(problem, width)
+    sizes = _Sizes(scaled, steps, _rate(system) / unit, np.full(len(unit), FAR), steps)
+    found, kept = Rows([], []), []
+    _profile_rows(found, sizes, steps)
+    if not found.parts:
+        return None
+    _sampled_rows(found, sizes, steps, _SAMPLES)
+    _keep(kept, found, sizes, steps)
+    return _as_rows(problem, steps, found, kept, width, unit, steps)
+
+
+def _rate(system: System) -> np.ndarray:
+    """Half widths (p,) of what the inputs move by in a step."""
+    if system.input_rate is None:
+        return np.full(system.p, np.inf)
+    return np.asarray(system.input_rate.width, np.float64) / 2
+
+
 @dataclass(frozen=True)
 class _Sizes:
-    """What the parts of a row count: half widths of moves and of the box of d, (p,), in units."""
+    """What the parts of a row count: half widths (p,) of moves and of the box of d, in units; `over` is of the rows."""
 
     problem: GainProblem
     length: int
     move: np.ndarray
     d: np.ndarray
+    over: int = 1
 
     def of_parts(self) -> np.ndarray:
         P, N = self.problem, self.length
@@ -106,7 +124,7 @@ class _Sizes:
             if j + 1 < steps:
                 after[moving] = moves[j + 1]
             # The box that was found for d is of use at the oldest step; that of an input with bounds always is.
-            allowed = np.arange(p) if j == 0 and steps > 1 else bounded
+            allowed = np.arange(p) if j == 0 and steps > self.over else bounded
             box[allowed] = boxes[j][allowed]
             of_moves.append(move)
             of_boxes.append(box)
@@ -118,7 +136,7 @@ class _Sizes:
 
         parts = [*blocks(slopes), states[-1], *blocks(of_f), *blocks(of_g), *blocks(of_moves), *blocks(of_boxes)]
         target = np.zeros((steps * p, p))
-        target[-p:] = -np.eye(p)
+        target[-p * self.over :] = np.tile(-np.eye(p), (self.over, 1))
         stacked = np.vstack(parts)
         return WindowProgram(stacked, np.zeros((len(stacked), p)), np.vstack(equal), target)
 
@@ -126,7 +144,7 @@ class _Sizes:
 def _profile_rows(found: Rows, sizes: _Sizes, steps: int) -> np.ndarray:
     """Add the best rows over every number of steps; the half widths (p,) that they reach."""
     size, reached = sizes.of_parts(), np.full(len(sizes.d), FAR)
-    for s in range(1, steps + 1):
+    for s in range(sizes.over, steps + 1):
         program = sizes.program(s)
         for j in range(len(reached)):
             row = program.best(j, size, np.zeros_like(size))
@@ -184,7 +202,9 @@ def _units(problem: GainProblem, x: np.ndarray) -> np.ndarray:
     return 1.0 / np.abs(stacked).max(axis=0)
 
 
-def _as_rows(problem: GainProblem, length: int, rows: Rows, kept: list[int], x: np.ndarray, d: np.ndarray) -> InputRows:
+def _as_rows(
+    problem: GainProblem, length: int, rows: Rows, kept: list[int], x: np.ndarray, d: np.ndarray, over: int = 1
+) -> InputRows:
     """The kept rows in the units of the plant, newest step first."""
     n, l, p, N, R = problem.n, problem.l, len(d), length, len(kept)
     parts = np.array([rows.parts[r] for r in kept])
@@ -210,4 +230,5 @@ def _as_rows(problem: GainProblem, length: int, rows: Rows, kept: list[int], x: 
         left=np.zeros((N, R, p)),
         targets=tuple(int(targets[r]) for r in order),
         counts=tuple(int((depth > lag).sum()) for lag in range(N)),
+        over=over,
     )

@@ -1,8 +1,8 @@
 """What earlier steps say of the unknown input, where it is known how it moves with time (theory 7.5).
 
-A box of d[k-2] and a bound of ``d[k-1] - d[k-2]`` give a box of d[k-1], for every plant. Rows over several steps add the
-plant's equations, each with a multiplier, so that all they leave of the inputs is d[k-1], bounded steps of it, and the
-box that was found for it some steps ago: the noise of one difference is spread over many.
+A box of d[k-2] and a bound of ``d[k-1] - d[k-2]`` give a box of d[k-1], for every plant. Rows over several steps add
+the plant's equations, each with a multiplier, so that all they leave of the inputs is d[k-1], bounded moves of it, and
+the box that was found for it some steps ago: the noise of one difference is spread over many.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.inclusion.atoms import wider
 from gsisio_jax.interval import rounding
@@ -28,8 +29,9 @@ from gsisio_jax.observer.window import added, by_state
 class InputRows(eqx.Module):
     """R rows for single inputs over the last N steps; lag t stands for step k-1-t.
 
-        d_j[k-1] = now x[k] - sum over t of {multipliers [f + B u + w; g + D u + v - y] - (those of x) x}[k-1-t]
-                   - sum over t of boxes d[k-1-t] - sum over t of moves (d[k-1-t] - d[k-2-t])
+        sum of d_j[k-1-t] over t < over =
+            now x[k] - sum over t of {multipliers [f + B u + w; g + D u + v - y] - (those of x) x}[k-1-t]
+            - sum over t of boxes d[k-1-t] - sum over t of moves (d[k-1-t] - d[k-2-t])
 
     What multiplies x[k-1-t] is the part of lag t+1 that acts on f, and `now` is that of lag 0.
 
@@ -39,6 +41,7 @@ class InputRows(eqx.Module):
         left: (N, R, p), what the rows leave of the inputs by rounding.
         targets: the input j of every row.
         counts: how many rows, the first ones, look back to lag 0, 1, ...
+        over: 1 for d[k-1] itself.
     """
 
     multipliers: Any
@@ -47,6 +50,7 @@ class InputRows(eqx.Module):
     left: Any
     targets: tuple[int, ...] = eqx.field(static=True)
     counts: tuple[int, ...] = eqx.field(static=True)
+    over: int = eqx.field(static=True, default=1)
 
     @property
     def length(self) -> int:
@@ -100,9 +104,7 @@ def after(observer: Any, carry: Any, d: Interval, conflict: Any, hold: bool) -> 
         older = choose(conflict, nothing, older)
     joined = (jnp.concatenate([new[None], old])[: len(old)] for new, old in zip(_sides(d), _sides(older), strict=True))
     following = memory.phase + 1
-    return InputMemory(
-        Interval.unchecked(*joined), jnp.where(following >= (system.input_constant or 1), 0, following)
-    )
+    return InputMemory(Interval.unchecked(*joined), jnp.where(following >= (system.input_constant or 1), 0, following))
 
 
 @jax.named_scope("input memory")
@@ -115,30 +117,36 @@ def contract(maps: Any, domain: Domain, carry: Any, d: Interval) -> tuple[Interv
     domain = domain.taken(met)
     if maps.observer.input_rows is None:
         return d, domain
-    found = by_state(_from_rows(maps, domain.box, carry, d), maps.observer.input_rows.targets, d.shape[0])
+    rows = maps.observer.input_rows
+    pasts = (past.last(carry, None), *carry.older[: rows.length - 1])
+    inputs = [d, *(memory.boxes[t] for t in range(rows.length - 1))]
+    moves = [_moves(maps.observer, memory, lag, d.dtype) for lag in range(rows.length)]
+    found = by_state(from_rows(maps, rows, domain.box, pasts, inputs, moves), rows.targets, d.shape[0])
     met = Domain.of(d, 0.0).intersect(found, Source.INPUT)
     return met.box, domain.taken(met)
 
 
-def _from_rows(maps: Any, x: Interval, carry: Any, d: Interval) -> Interval:
-    """Boxes (R,) from every row."""
-    observer, rows, memory = maps.observer, maps.observer.input_rows, carry.memory
-    system, dtype, terms = observer.system, d.dtype, rows.terms
-    n = system.n
-    pasts = (past.last(carry, None), *carry.older[: rows.length - 1])
-    inputs = [d, *(memory.boxes[t] for t in range(rows.length - 1))]
+def from_rows(maps: Any, rows: InputRows, x: Interval, pasts: Any, inputs: Any, moves: Any) -> Interval:
+    """Boxes (R,) from every row.
+
+    Args:
+        maps: of the observer.
+        rows: to be evaluated.
+        x: box of x[k].
+        pasts, inputs, moves: of lag 0, 1, ...: the step, the box of d[k-1-t], and that of d[k-1-t] - d[k-2-t].
+    """
+    system, dtype, terms, n = maps.observer.system, x.dtype, rows.terms, maps.observer.system.n
     total = _negative(plain_image(rows.multipliers[0][:, :n], widened_for_sums(x, n + terms)))
     holds = jnp.ones(len(rows.targets), bool)
     # Constants are widened for the sum of one row; here they go on through those of all lags.
     constants: Any = jnp.zeros(len(rows.targets), dtype)
     for lag, (before, count) in enumerate(zip(pasts, rows.counts, strict=True)):
         multipliers = rows.multipliers[lag][:count]
-        older = rows.multipliers[lag + 1][:count, :n] if lag + 1 < rows.length else jnp.zeros((count, n), dtype)
+        older = rows.multipliers[lag + 1][:count, :n] if lag + 1 < rows.length else np.zeros((count, n))
         # f and g jointly on the box of that step, slopes combined first; then what is known of it.
         of_maps = maps.rows(multipliers, older)
         found = of_maps.joint_box(maps.states(before.state), before.h)
-        shift = shift_box(system, before.y, before.u, before.noise)
-        known = [shift, inputs[lag], _moves(observer, memory, lag, dtype)]
+        known = [shift_box(system, before.y, before.u, before.noise), inputs[lag], moves[lag]]
         weights = jnp.concatenate([multipliers, rows.boxes[lag][:count], rows.moves[lag][:count]], -1)
         sides = (jnp.concatenate([getattr(box, side) for box in known]) for side in ("lower", "upper"))
         part = plain_image(weights, widened_for_sums(Interval.unchecked(*sides), weights.shape[-1] + terms))
@@ -149,9 +157,9 @@ def _from_rows(maps: Any, x: Interval, carry: Any, d: Interval) -> Interval:
         )
         constants = added(constants, abs(of_maps.constant))
         measured = (multipliers[:, n:] != 0).any(-1)
-        used = (multipliers != 0).any(-1)
-        told = before.trusted & (~measured | before.believed)
-        holds = jnp.concatenate([holds[:count] & (told | ~used), holds[count:]])
+        unused = (multipliers == 0).all(-1)
+        told = unused | (before.trusted & (~measured | before.believed))
+        holds = jnp.concatenate([holds[:count] & told, holds[count:]])
     loose = wider(constants, terms)
     return everything_unless(holds, Interval.unchecked(-(total.upper + loose), -(total.lower - loose)))
 

@@ -75,7 +75,10 @@ def known(observer: Any, past: Past, terms: int) -> Interval:
 
 def _depth(observer: Any) -> int:
     """How many steps back the rows of an observer look."""
-    return max((rows.length for rows in (observer.window, observer.recovery, observer.input_rows) if rows is not None), default=1)
+    return max(
+        (rows.length for rows in (observer.window, observer.recovery, observer.input_rows) if rows is not None),
+        default=1,
+    )
 
 
 def _as_needed(pasts: tuple[Past, ...], observer: Any) -> tuple[Past, ...]:

@@ -117,7 +117,9 @@ def input_row_residual(rows: Any, plant: Any, H_slack: Any) -> np.ndarray:
     for lag in range(N):
         of_f, of_g = exact(rows.multipliers[lag][:, :n]), exact(rows.multipliers[lag][:, n:])
         left = of_f.dot(G) + of_g.dot(H) - exact(rows.boxes[lag]) - moves[lag]
-        left = left + moves[lag - 1] if lag else left - exact(np.eye(plant.p)[list(rows.targets)])
+        left = left + moves[lag - 1] if lag else left
+        if lag < rows.over:
+            left = left - exact(np.eye(plant.p)[list(rows.targets)])
         found.append(rounded_up(abs(left) + abs(of_g).dot(slack)))
     return np.array(found).reshape(N, len(rows.targets), plant.p)
 

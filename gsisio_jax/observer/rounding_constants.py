@@ -143,8 +143,7 @@ def with_rounding_constants(
         window = _cast_window(window, left_x, left_d, wide.T2, dtype)
     input_rows = wide.input_rows
     if input_rows is not None:
-        left_d = _cast(input_row_residual(input_rows, system, H_slack), dtype)
-        input_rows = replace(jax.tree.map(lambda x: np.asarray(x, dtype), input_rows), left=left_d)
+        input_rows = with_input_residual(input_rows, system, H_slack, dtype)
     recovery = None if affine is None else _recovery(wide, system, affine, H_slack, dtype)
     first = InitialContraction(
         form=None if system.g_takes_u else jax.tree.map(lambda x: np.asarray(x, dtype), form),
@@ -201,6 +200,12 @@ def _cast_window(window: Any, left_x: np.ndarray, left_d: np.ndarray, T2: np.nda
     stored = replace(window, output=_rounded_once(window.remainder, T2))
     stored = jax.tree.map(lambda x: np.asarray(x, dtype), replace(stored, left_x=np.zeros(0), left_d=np.zeros(0)))
     return replace(stored, left_x=_cast(left_x, dtype), left_d=_cast(left_d, dtype))
+
+
+def with_input_residual(rows: Any, system: Any, H_slack: np.ndarray, dtype: Any) -> Any:
+    """Rows for inputs as they are in that type, with what they leave."""
+    rows = jax.tree.map(lambda x: np.asarray(x, dtype), rows)
+    return replace(rows, left=_cast(input_row_residual(rows, system, H_slack), dtype))
 
 
 def _recovery(wide: Any, system: Any, affine: AffineMaps, H_slack: np.ndarray, dtype: Any) -> Any:

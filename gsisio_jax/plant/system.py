@@ -53,8 +53,8 @@ class System(eqx.Module):
 
     Raises:
         ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
-            the wrong shape, known inputs have no effect, or a bound does not fit or is negative; an index or a period cannot be, an
-            unbounded input enters a periodic output, or f or g change with a periodic state.
+            the wrong shape, known inputs have no effect, or a bound does not fit or is negative; an index or a period
+            cannot be, an unbounded input enters a periodic output, or f or g change with a periodic state.
 
     Source: paper, (eq:system); theory 1, 7.5 and 8.4.
     """
