@@ -17,6 +17,7 @@ from gsisio_jax.observer.input_memory import InputRows
 from gsisio_jax.plant.system import System
 
 _STEPS = 16  # how far rows look back where `window` does not say more
+_DEPTHS = (1, 2, 3, 4, 6, 9)  # numbers of steps that have rows of their own, besides the largest
 _SAMPLES, _TESTED = 12, 100  # samples that exact rows are asked for, and that rows are chosen on
 _MOST_ROWS, _LEAST_GAIN = 16, 5e-3  # of an input, and share of the width that one more row must bring
 
@@ -49,11 +50,11 @@ def rows_of_inputs(problem: GainProblem, system: System, window: int | str, widt
         for _ in range(3):
             best = _profile_rows(found, sizes, steps)
             sizes = _Sizes(scaled, length, move, np.minimum(sizes.d, best + np.where(np.isfinite(move), move, 0)))
-        # Within a block rows may not look back beyond its beginning: each number of steps has rows of its own.
-        depths = range(1, steps + 1) if not move.any() else (steps,)
+        # Rows may not look back beyond the beginning of a block or of a record: fewer steps have rows of their own.
+        depths = range(1, steps + 1) if not move.any() else [*(s for s in _DEPTHS if s < steps), steps]
         for depth in depths:
-            _sampled_rows(found, sizes, depth, _SAMPLES if len(depths) == 1 else _SAMPLES // 4)
-            _keep(kept, found, sizes, depth)
+            _sampled_rows(found, sizes, depth, _SAMPLES if depth == steps else _SAMPLES // 4)
+            _keep(kept, found, sizes, depth, _LEAST_GAIN if depth == steps else 4 * _LEAST_GAIN)
     return _as_rows(problem, length, found, kept, width, unit) if kept else None
 
 
@@ -66,7 +67,7 @@ def rows_of_sums(problem: GainProblem, system: System, steps: int, width: np.nda
     if not found.parts:
         return None
     _sampled_rows(found, sizes, steps, _SAMPLES)
-    _keep(kept, found, sizes, steps)
+    _keep(kept, found, sizes, steps, _LEAST_GAIN)
     return _as_rows(problem, steps, found, kept, width, unit, steps)
 
 
@@ -166,8 +167,9 @@ def _sampled_rows(found: Rows, sizes: _Sizes, steps: int, samples: int) -> None:
                     _add(found, j, row[0], sizes)
 
 
-def _keep(kept: list[int], found: Rows, sizes: _Sizes, steps: int) -> None:
-    """Add to `kept` what helps most on fresh samples, as long as it helps, of the rows that look back so many steps."""
+def _keep(kept: list[int], found: Rows, sizes: _Sizes, steps: int, least: float) -> None:
+    """Add to `kept` what helps most on fresh samples, of the rows that look back so many steps: as long as one brings
+    that share of the width."""
     parts, size = np.array(found.parts), sizes.of_parts()
     drift = size * np.random.default_rng(1).uniform(-1, 1, (_TESTED, len(size)))
     spread, moved = np.abs(parts) @ size, drift @ parts.T
@@ -181,7 +183,7 @@ def _keep(kept: list[int], found: Rows, sizes: _Sizes, steps: int) -> None:
         for _ in range(min(_MOST_ROWS, len(places))):
             tried = np.minimum(up[:, None], above[:, places]) + np.minimum(down[:, None], below[:, places])
             best = int(np.argmin(tried.mean(0)))
-            if not tried[:, best].mean() < (up + down).mean() * (1 - _LEAST_GAIN):
+            if not tried[:, best].mean() < (up + down).mean() * (1 - least):
                 break
             kept.append(int(places[best]))
             up, down = np.minimum(up, above[:, kept[-1]]), np.minimum(down, below[:, kept[-1]])
