@@ -14,6 +14,7 @@ from gsisio_jax.observer.alarms import Alarm
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.estimation import Estimate, estimate, start, step
+from gsisio_jax.observer.mean_input import mean_input
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.status import Status
 from gsisio_jax.observer.tolerant import TolerantObserver
@@ -65,6 +66,7 @@ __all__ = [
     "linear_image",
     "load_carry",
     "load_observer",
+    "mean_input",
     "monte_carlo",
     "nearest",
     "paper",

@@ -17,12 +17,14 @@ from .study_config import MonteCarloPart, SweepPart
 
 
 class SystemPart(Part):
-    """Where the System comes from, and the periods of the outputs and states that are angles, by name."""
+    """Where the System comes from; by name the periods of outputs and states that are angles, and rates of inputs."""
 
     use: Reference
     arguments: dict[str, Any] = Field(default_factory=dict)
     periodic: dict[str, Number] = Field(default_factory=dict)
     periodic_states: dict[str, Number] = Field(default_factory=dict)
+    input_rate: dict[str, Number] = Field(default_factory=dict)
+    input_constant: Annotated[int, Field(ge=1)] | None = None
 
 
 class Signal(Part):

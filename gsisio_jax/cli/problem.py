@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..interval import Interval
 from ..plant.system import Noise, System
 from .config import Config, Signal
@@ -138,7 +140,7 @@ def build_problem(config: Config, file: str) -> Problem:
     }
     _check_unique(groups, file)
     return Problem(
-        system=_with_periods(system, config, groups, file),
+        system=_with_more(system, config, groups, file),
         noise=Noise(w=box("noise.w", config.noise.w, "states"), v=box("noise.v", config.noise.v, "outputs")),
         region=region,
         u_region=None if config.u_region is None else box("u_region", config.u_region, "known inputs"),
@@ -171,8 +173,8 @@ def _system(config: Config, file: str) -> Any:
     return found
 
 
-def _with_periods(system: Any, config: Config, groups: dict[str, Names], file: str) -> Any:
-    """The system with the periodic outputs and states of the file, where it names some."""
+def _with_more(system: Any, config: Config, groups: dict[str, Names], file: str) -> Any:
+    """The system with what the file says of it: periodic outputs and states, and how the unknown input moves."""
 
     def by_index(key: str, group: str, given: dict[str, float], own: Any) -> dict[int, float]:
         names = groups[group].names
@@ -182,14 +184,19 @@ def _with_periods(system: Any, config: Config, groups: dict[str, Names], file: s
         return {names.index(name): period for name, period in given.items()} or dict(own)
 
     part = config.system
-    if not (part.periodic or part.periodic_states):
+    if not (part.periodic or part.periodic_states or part.input_rate or part.input_constant):
         return system
     outputs = by_index("periodic", "output", part.periodic, system.periodic)
     states = by_index("periodic_states", "state", part.periodic_states, system.periodic_states)
+    rate: Any = system.input_rate
+    if part.input_rate:
+        given = by_index("input_rate", "input", part.input_rate, {})
+        rate = [given.get(j, np.inf) for j in range(system.p)]
     try:
         return System(
             system.f, system.g, system.G, system.H, system.B, system.D, system.state_bounds, system.input_bounds,
-            system.m, periodic=outputs, periodic_states=states,
+            system.m, periodic=outputs, periodic_states=states, input_rate=rate,
+            input_constant=part.input_constant or system.input_constant,
         )  # fmt: skip
     except ValueError as error:
         raise UserError(f"{file}: system: {reason(error)}") from error

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
+from gsisio_jax.observer.checks import refuse_input_model
 from gsisio_jax.plant.system import Noise, System
 
 _MOST_CELLS = 10_000
@@ -55,6 +56,9 @@ def checked(
             "design_observer: `window` must be 1 in the prediction form and where states are periodic (boxes of "
             f"different steps may lie a period apart), got {window!r}"
         )
+    if form == "prediction" or system.periodic_states:
+        where = "in the prediction form" if form == "prediction" else "where states are periodic"
+        refuse_input_model("design_observer", system, f"which says nothing {where}; make the System without it")
     for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
         if box.shape != (size,):
             raise ValueError(

@@ -28,6 +28,7 @@ from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.gains_with_less import gains_with_less
 from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
 from gsisio_jax.design.initial_contraction import check_initial_contraction
+from gsisio_jax.design.input_rows import rows_of_inputs
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.progress import Say
 from gsisio_jax.design.recovery import with_recovery
@@ -147,6 +148,7 @@ def design_current(
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
+    observer = replace(observer, input_rows=rows_of_inputs(problem, system, dials.window, width))
     if maps is not None:
         rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
         observer = replace(observer, recovery=rows_alone)

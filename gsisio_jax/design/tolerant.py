@@ -16,6 +16,7 @@ from gsisio_jax.design.gains import profile_gain
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.checks import refuse_input_model
 from gsisio_jax.observer.recovery import Recovery
 from gsisio_jax.observer.recovery_constants import AffineMaps
 from gsisio_jax.observer.tolerant import MOST_GUESSES, TolerantObserver
@@ -55,6 +56,8 @@ def check_tolerate(tolerate: Any, system: System, form: str, missing: bool, wind
     ):
         if got is not None:
             raise ValueError(f"design_observer: with `tolerate`, `{name}` must be {legal}, got {got}")
+    why = "which boxes of guesses about wrong outputs do not carry; leave it out, or tolerate nothing"
+    refuse_input_model("design_observer", system, why)
     if system.periodic or system.periodic_states:
         raise ValueError(
             "design_observer: with `tolerate`, no output or state may be periodic; unwrap the outputs (numpy.unwrap), "

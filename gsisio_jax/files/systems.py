@@ -74,13 +74,16 @@ def _numbers(stored: System, system: System) -> list[str]:
     found = []
     for name in ("G", "H", "B", "D"):
         found += _entries(name, *_in_one_type(getattr(stored, name), getattr(system, name)))
-    for name in ("state_bounds", "input_bounds"):
+    for name in ("state_bounds", "input_bounds", "input_rate"):
         file, here = getattr(stored, name), getattr(system, name)
+        if file is None or here is None:
+            found += [] if file is here else [f"{name} is {file} in the file and {here} here"]
+            continue
         dtype = min(file.dtype, here.dtype, key=lambda dtype: np.dtype(dtype).itemsize)
         file, here = file.astype(dtype), here.astype(dtype)
         for side in ("lower", "upper"):
             found += _entries(f"{name}.{side}", *_in_one_type(getattr(file, side), getattr(here, side)))
-    for name in ("periodic", "periodic_states", "f_takes_u", "g_takes_u"):
+    for name in ("periodic", "periodic_states", "f_takes_u", "g_takes_u", "input_constant"):
         file, here = getattr(stored, name), getattr(system, name)
         if file != here:
             found.append(f"{name} is {file} in the file and {here} here")

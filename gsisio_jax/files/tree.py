@@ -31,7 +31,7 @@ def _classes() -> dict[str, type]:
     from gsisio_jax.inclusion.atoms import AtomBounds
     from gsisio_jax.inclusion.planes import Abstraction
     from gsisio_jax.interval.box import Interval
-    from gsisio_jax.observer import bank, past, recovery, slices, types, window, window_widths
+    from gsisio_jax.observer import bank, input_memory, past, recovery, slices, types, window, window_widths
     from gsisio_jax.observer.certificate import Certificate
     from gsisio_jax.observer.delayed import DelayedObserver, Waiting
     from gsisio_jax.observer.prediction_step import PredictionObserver
@@ -44,6 +44,7 @@ def _classes() -> dict[str, type]:
         bank.CancellationResidual, bank.LinearBounds, types.Carry, types.ExactInputs, types.InitialContraction,
         types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, slices.Slices, window.Window,
         window_widths.WindowWidths,
+        input_memory.InputMemory, input_memory.InputRows,
     )  # fmt: skip
     return {kind.__name__: kind for kind in found}
 

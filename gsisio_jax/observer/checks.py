@@ -46,6 +46,13 @@ def refuse_tolerant(call: str, observer: AnyObserver) -> None:
         )
 
 
+def refuse_input_model(call: str, system: Any, why: str) -> None:
+    """For calls that know nothing of how the unknown input moves."""
+    for name in ("input_rate", "input_constant"):
+        if getattr(system, name) is not None:
+            raise ValueError(f"{call}: the system has `{name}`, {why}")
+
+
 def check_length(length: Any, rows: int) -> None:
     if np.ndim(length) or not jnp.issubdtype(jnp.result_type(length), jnp.integer):
         raise ValueError(f"estimate: `length` must be one integer per record, got {length!r}; for many use jax.vmap")

@@ -72,8 +72,9 @@ class Maps:
         """Number of terms that a row can have, for rounding."""
         system = self.observer.system
         atoms = system.n + system.l if self.expansion is None else len(self.expansion.atoms)
-        window = self.observer.window
-        steps = 0 if window is None else window.terms
+        steps = max(
+            (rows.terms for rows in (self.observer.window, self.observer.input_rows) if rows is not None), default=0
+        )
         return system.n + atoms + self.observer.T2.shape[0] + 4 + steps
 
     def states(self, box: Interval) -> States:

@@ -75,11 +75,12 @@ def known(observer: Any, past: Past, terms: int) -> Interval:
 
 def _depth(observer: Any) -> int:
     """How many steps back the rows of an observer look."""
-    return max((rows.length for rows in (observer.window, *(observer.recovery or ())) if rows is not None), default=1)
+    rows = (observer.window, observer.input_rows, *(observer.recovery or ()))
+    return max((group.length for group in rows if group is not None), default=1)
 
 
 def _as_needed(pasts: tuple[Past, ...], observer: Any) -> tuple[Past, ...]:
-    whole = 0 if observer.window is None else observer.window.length - 1
+    whole = max((rows.length - 1 for rows in (observer.window, observer.input_rows) if rows is not None), default=0)
     return (*pasts[:whole], *(past.without_boxes() for past in pasts[whole:]))
 
 

@@ -24,6 +24,7 @@ from gsisio_jax.observer.recovery_constants import AffineMaps, with_constants
 from gsisio_jax.observer.residuals import (
     cancellation_residual,
     exact,
+    input_row_residual,
     nearest_feedthrough,
     rounded_up,
     row_cancellation_residual,
@@ -156,6 +157,9 @@ def with_rounding_constants(
     if window is not None:
         left_x, left_d = window_residual(window, system, wide.C, wide.bounded_inputs, H_slack)
         window = _cast_window(window, left_x, left_d, wide.T2, dtype)
+    input_rows = wide.input_rows
+    if input_rows is not None:
+        input_rows = with_input_residual(input_rows, system, H_slack, dtype)
     recovery = [_recovery(rows, wide, system, affine, H_slack, dtype) for rows in wide.recovery or () if affine]
     first = InitialContraction(
         form=None if system.g_takes_u else jax.tree.map(lambda x: np.asarray(x, dtype), form),
@@ -180,6 +184,7 @@ def with_rounding_constants(
         region_inverse=_cast(inverse, dtype),
         window=window,
         recovery=tuple(rows for rows in recovery if rows is not None),
+        input_rows=input_rows,
         corrections=_corrections(spectral_radius(implicit)) if certificate.promised else 0,
         certificate=certificate,
     )
@@ -211,6 +216,12 @@ def _cast_window(window: Any, left_x: np.ndarray, left_d: np.ndarray, T2: np.nda
     stored = replace(window, output=_rounded_once(window.remainder, T2))
     stored = jax.tree.map(lambda x: np.asarray(x, dtype), replace(stored, left_x=np.zeros(0), left_d=np.zeros(0)))
     return replace(stored, left_x=_cast(left_x, dtype), left_d=_cast(left_d, dtype))
+
+
+def with_input_residual(rows: Any, system: Any, H_slack: np.ndarray, dtype: Any) -> Any:
+    """Rows for inputs as they are in that type, with what they leave."""
+    rows = jax.tree.map(lambda x: np.asarray(x, dtype), rows)
+    return replace(rows, left=_cast(input_row_residual(rows, system, H_slack), dtype))
 
 
 def _recovery(rows: Any, wide: Any, system: Any, affine: AffineMaps, H_slack: np.ndarray, dtype: Any) -> Any:

@@ -16,7 +16,7 @@ from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, nan_to_unbounded
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
-from gsisio_jax.observer import cells, periodic, recovery, restart, window
+from gsisio_jax.observer import cells, input_memory, periodic, recovery, restart, window
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
@@ -47,7 +47,7 @@ def blank(observer: Observer, initial: Interval) -> Carry:
     h = AtomBounds(jnp.zeros((atoms, n), dtype), zero, zero + jnp.inf, entire, *values)
     yes, no = jnp.asarray(True), jnp.asarray(False)
     carry = Carry(initial, h, jnp.full(l, jnp.nan, dtype), jnp.zeros(m, dtype), noise, yes, no)
-    return replace(carry, older=before_all(carry, observer))
+    return replace(carry, older=before_all(carry, observer), memory=input_memory.blank(observer, dtype))
 
 
 @rounding.by_observer
@@ -173,6 +173,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
     # boxes lie in the region.
     with _stage("inputs"):
         d, domain = from_inverses(maps, domain, states, d_fixed, psi)
+        d, domain = input_memory.contract(maps, domain, carry, d)
         moved = moved_without(maps, past, carry, known.terms)
         domain = dynamics(maps, domain, moved, d)
     domain, promised = certified(maps, domain, past, carry, right, known, left[0], newton, u)
@@ -237,7 +238,8 @@ def _finish(
         (~applies, Status.OUTSIDE_REGION),
     )
     older = shifted(carry, observer, d, conflict & fallback.conflict if hold else conflict)
-    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed, older)
+    memory = input_memory.after(observer, carry, d, conflict, hold)
+    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed, older, memory)
     return after, StepOutput(state, d, d_now, bit_mask(bits), *domain.report())
 
 

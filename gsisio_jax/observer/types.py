@@ -127,6 +127,7 @@ class Observer(eqx.Module):
         rounding_constants: what the gains leave by rounding.
         window: rows over several steps (`observer.window.Window`), or None.
         recovery: rows that need no box to begin with (`observer.recovery.Recovery`), those of one length together.
+        input_rows: rows for the unknown input over several steps (`observer.input_memory.InputRows`), or None.
         corrections: Newton steps to the point that the certified bound is around (theory 5.6).
         cells: into how many parts the box of every state is cut for the outputs (`observer.cells`); () for none.
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
@@ -155,6 +156,7 @@ class Observer(eqx.Module):
     sweeps: int = eqx.field(static=True)
     window: Any = None
     recovery: Any = ()
+    input_rows: Any = None
     corrections: int = eqx.field(static=True, default=0)
     cells: tuple[int, ...] = eqx.field(static=True, default=())
     rounding: Rounding = eqx.field(static=True, default="outward")
@@ -253,6 +255,7 @@ class Carry(eqx.Module):
         starts: nothing has been measured yet.
         believed: no conflict has taken y[k] out of what is believed.
         older: the steps before, as far as rows look back (`observer.past.Past`).
+        memory: earlier boxes of the input, where it is known how it moves (`observer.input_memory.InputMemory`).
     """
 
     state: Interval
@@ -263,6 +266,7 @@ class Carry(eqx.Module):
     starts: Any
     believed: Any
     older: Any = ()
+    memory: Any = None
 
 
 class StepOutput(eqx.Module):

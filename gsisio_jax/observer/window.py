@@ -100,8 +100,8 @@ def contract(
         weights = jnp.concatenate([multipliers, window.known[lag][:count]], -1)
         known = plain_image(weights, past.known(maps.observer, before, weights.shape[-1] + window.terms))
         part = Interval.unchecked(found.lower + known.lower, found.upper + known.upper)
-        total = Interval.unchecked(_added(total.lower, part.lower), _added(total.upper, part.upper))
-        constants = _added(constants, abs(rows.constant))
+        total = Interval.unchecked(added(total.lower, part.lower), added(total.upper, part.upper))
+        constants = added(constants, abs(rows.constant))
         measured = (multipliers[:, n:] != 0).any(-1)
         holds = jnp.concatenate([holds[:count] & before.trusted & (~measured | before.believed), holds[count:]])
     # The part of x[k] itself, psi, on the box so far.
@@ -120,7 +120,7 @@ def contract(
     return domain.intersect(by_state(everything_unless(holds, box), window.targets, n), Source.STATE)
 
 
-def _added(total: Any, part: Any) -> Any:
+def added(total: Any, part: Any) -> Any:
     """The part added to as many rows as it has."""
     return jnp.concatenate([total[: part.shape[0]] + part, total[part.shape[0] :]])
 

@@ -89,7 +89,7 @@ def lifted(plant: System, delay: int, more: tuple[Pieces, ...] = ()) -> System:
     below = np.zeros((count, plant.p)), np.zeros((count, plant.m))
     return System(
         plant.f, output, plant.G, np.vstack([plant.H, below[0]]), plant.B, np.vstack([plant.D, below[1]]),
-        plant.state_bounds, plant.input_bounds,
+        plant.state_bounds, plant.input_bounds, input_rate=plant.input_rate, input_constant=plant.input_constant,
     )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.plant.calls import as_static, as_vector, check_map, hashable, takes_u
 from gsisio_jax.plant.captured import Captured, captured, changed
+from gsisio_jax.plant.input_model import read_constant, read_rate
 from gsisio_jax.plant.periodic import Periods, check_feedthrough, check_states, read_periods, turns
 from gsisio_jax.plant.pickled import check_named
 
@@ -44,13 +45,18 @@ class System(eqx.Module):
             stay on the real line as long as the multiple is known; where it is lost (an unknown heading, an unbounded
             d that turns it, a gap, a conflict) a box holds the state plus some multiple, see `wrapped` and `nearest`.
             Needs `periodic` outputs (there is nothing to choose without them), and acts in the current form.
+        input_rate: bound (p,) of |d[k] - d[k-1]| per step, units of the input, or a box (p,) of d[k] - d[k-1]; inf
+            where nothing is known. 0 says that the input never changes.
+        input_constant: m, in steps: the unknown input changes at k = 0, m, 2m, ... alone (an actuator or a load that is
+            set every m-th step), k counting from the first row of a record. With `input_rate` it changes by at most
+            that much there.
 
     Raises:
         ValueError: a matrix is not finite or has the wrong shape, ``[G; H]`` has not full column rank, f or g returns
-            the wrong shape, known inputs have no effect, or a bound does not fit; an index or a period cannot be, an
-            unbounded input enters a periodic output, or f or g change with a periodic state.
+            the wrong shape, known inputs have no effect, or a bound does not fit or is negative; an index or a period
+            cannot be, an unbounded input enters a periodic output, or f or g change with a periodic state.
 
-    Source: paper, (eq:system); theory 1 and 8.4.
+    Source: paper, (eq:system); theory 1, 7.5 and 8.4.
     """
 
     f: Callable[..., Any] = eqx.field(static=True)
@@ -67,6 +73,8 @@ class System(eqx.Module):
     periodic: Periods = eqx.field(static=True)
     periodic_states: Periods = eqx.field(static=True)
     turns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    input_rate: Interval | None
+    input_constant: int | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -82,6 +90,8 @@ class System(eqx.Module):
         *,
         periodic: Mapping[int, float] | None = None,
         periodic_states: Mapping[int, float] | None = None,
+        input_rate: Any = None,
+        input_constant: int | None = None,
     ):
         self.f, self.g = as_static(f), as_static(g)
         self.G, self.H = _matrix("G", G), _matrix("H", H)
@@ -98,6 +108,8 @@ class System(eqx.Module):
         _check_rank(self.G, self.H)
         self.state_bounds = _bounds("state_bounds", state_bounds, self.n)
         self.input_bounds = _bounds("input_bounds", input_bounds, self.p)
+        self.input_rate = read_rate(input_rate, self.p)
+        self.input_constant = read_constant(input_constant, self.p)
         self.captured = captured(f), captured(g)
         self.periodic = read_periods("periodic", periodic, self.l, "output")
         self.periodic_states = read_periods("periodic_states", periodic_states, self.n, "state")

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer.checks import AnyObserver, prepare
+from gsisio_jax.observer.checks import AnyObserver, prepare, refuse_input_model
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.enclosures import slopes_of
 from gsisio_jax.observer.estimation import estimate
@@ -81,6 +81,7 @@ def tightness(
             f"{call}: the system is periodic, so what agrees with the record is no convex set; unwrap the outputs "
             "(numpy.unwrap) and leave `periodic` and `periodic_states` out of the System"
         )
+    refuse_input_model(call, system, "which the exact hull does not know, so boxes may be smaller; leave it out")
     chosen = _chosen(steps, len(u_ready))
     if horizon is not None and (isinstance(horizon, bool) or int(horizon) != horizon or horizon < 1):
         raise ValueError(f"{call}: `horizon` must be a number of steps of at least 1, or None, got {horizon!r}")

@@ -117,6 +117,10 @@ def monte_carlo(
     need("xarray", extra="study", purpose="a Monte Carlo study")
     observer = checks.rounded(CALL, observer, rounding)
     checks.refuse_tolerant(CALL, observer)
+    checks.refuse_input_model(
+        CALL, observer.system, "and drawn inputs are not held against it; simulate inputs that keep to it with "
+        "gx.simulate, and use gx.estimate or gx.sweep"
+    )  # fmt: skip
     hold = checks.check_on_conflict(CALL, on_conflict)
     if on_miss not in ("raise", "record"):
         raise ValueError(f'{CALL}: `on_miss` must be "raise" or "record", got {on_miss!r}')
