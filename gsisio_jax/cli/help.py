@@ -29,6 +29,8 @@ in their own --help):
   arguments = {length = 3.0}         # these
   periodic = {heading = 360.0}       # outputs that are logged modulo a period, and
   periodic_states = {heading = 360.0}  # states that mean the same after one
+  input_rate = {leak = 0.1}          # an unknown input moves by no more than that in a step
+  input_constant = 10                # unknown inputs change at steps 0, 10, 20, ... only
   [signals]                          # names and units, in order; left out: x1, d1, y1, u1, ...
   state = [{name = "position", unit = "m"}]
   input = [{name = "leak", unit = "l/s"}]  # likewise output, known_input
@@ -41,8 +43,8 @@ in their own --help):
   [u_region]                         # box of known inputs; needed where f or g takes u
   [initial]                          # box of the first state
   [design]                           # options of gx.design_observer, which explains them
-  gains = 1                          # also sweeps, window, missing, certify, bounds, form = "prediction",
-                                     # left_inverse, allow_uncertified
+  gains = 1                          # also sweeps, window, delay, split, missing, certify, bounds,
+                                     # form = "prediction", left_inverse, allow_uncertified
   [estimate]
   on_conflict = "restart"            # or "hold": what is believed after a contradiction
   [outputs]                          # file names: netcdf, csv, picture, report; draw = "module:function"

@@ -196,8 +196,8 @@ def design_observer(
     Source: theory 3, 4 and 6; paper, Theorem 1.
     """
     check_cells(cells, form)
-    check_tolerate(tolerate, system, form, missing, window, delay)
     given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify, progress)
+    check_tolerate(tolerate, system, form, missing, window, delay)
     check_split(split, form)
     near = read_around(system, around, given is None)
     late = check_delay(delay, system, form)

@@ -64,7 +64,7 @@ def tightness(
     >>> turn = 0.95 * np.array([[0.955, -0.296], [0.296, 0.955]])
     >>> system = gx.System(lambda x: turn @ x, lambda x: x, G=np.zeros((2, 0)), H=np.zeros((2, 0)))
     >>> noise = gx.Noise(w=gx.Interval.symmetric([0.02, 0.02]), v=gx.Interval.symmetric([0.05, 2.0]))
-    >>> observer = gx.design_observer(system, noise, gx.Interval.symmetric([5.0, 5.0]), missing=False, sweeps=1)
+    >>> observer = gx.design_observer(system, noise, gx.Interval.symmetric([5.0, 5.0]), missing=False, window=1)
     >>> y = 0.03 * np.sin(np.arange(40.0)).reshape(20, 2)
     >>> found = gx.tightness(observer, gx.Interval.symmetric([3.0, 3.0]), y, steps=[9, 19])
     >>> print(found)

@@ -240,8 +240,8 @@ def whole_chunk(numbers: int, steps: float, loop_bytes: int) -> int:
         steps: of all cases together.
         loop_bytes: that XLA allows such a loop.
 
-    >>> whole_chunk(2500, 1e8, 2**23), whole_chunk(10_000, 1e8, 2**23), whole_chunk(2500, 1e6, 2**23)
-    (256, 64, 0)
+    >>> whole_chunk(2500, 1e9, 2**23), whole_chunk(10_000, 1e9, 2**23), whole_chunk(2500, 1e6, 2**23)
+    (256, 128, 0)
     """
     if not numbers or steps < WHOLE_PAYS:
         return 0

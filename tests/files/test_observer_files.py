@@ -162,8 +162,8 @@ def fields(header):
 
 UNKNOWN = {
     "newer": (
-        lambda h, a: (h.update(version=2, library="9.0"), h.pop("tree")),
-        "it is of version 2, written by gsisio_jax 9.0",
+        lambda h, a: (h.update(version=container.VERSION + 1, library="9.0"), h.pop("tree")),
+        f"it is of version {container.VERSION + 1}, written by gsisio_jax 9.0",
     ),
     "no tree": (lambda h, a: h.pop("tree"), "it is another file, or damaged .KeyError: 'tree'"),
     "new field": (lambda h, a: fields(h).update(colour=1), "it has unknown field of Observer: colour"),

@@ -87,7 +87,8 @@ def test_steps_come_one_late_and_are_those_of_the_record(spring, record):
         carry, out = gx.step(spring, carry, row)
         outputs.append(out)
     whole = gx.estimation.collect(spring, outputs)
-    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.array_equal(a, b)), whole, est))
+    # One program for all rows and one for a row round in other places.
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.allclose(a, b, rtol=1e-12, atol=1e-12)), whole, est))
 
 
 def check_contained(observer, name):
