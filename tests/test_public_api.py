@@ -40,7 +40,8 @@ def of_class(name: str, value: type) -> list[str]:
         return [f"{name}.{member.name} = {member.value}" for member in value]
     made = "" if issubclass(value, BaseException) else signature(value)
     lines = [f"class {name}{made}"]
-    for attribute in sorted(set(vars(value)) | set(getattr(value, "__annotations__", {}))):
+    ours = [kind for kind in value.__mro__ if kind.__module__.partition(".")[0] == gx.__name__]
+    for attribute in sorted({name for kind in ours for name in (*vars(kind), *vars(kind).get("__annotations__", {}))}):
         if attribute.startswith("_"):
             continue
         found = inspect.getattr_static(value, attribute, None)

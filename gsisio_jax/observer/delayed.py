@@ -9,7 +9,6 @@ Source: theory 5.9.
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from typing import Any
 
@@ -21,17 +20,17 @@ import numpy as np
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, entire_like
 from gsisio_jax.interval.image import image
-from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer import step as current_step
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.measurement import point
 from gsisio_jax.observer.status import Status
 from gsisio_jax.observer.types import Carry, Observer, StepOutput, cast
+from gsisio_jax.observer.wrapped import Wrapped
 from gsisio_jax.plant.lift import LiftedOutput, output_of
 from gsisio_jax.plant.system import Noise, System
 
 
-class DelayedObserver(eqx.Module):
+class DelayedObserver(Wrapped):
     """A designed observer that waits for L more measurements. Made by `design_observer(delay=L)`.
 
     Attributes:
@@ -49,26 +48,6 @@ class DelayedObserver(eqx.Module):
     delay: int = eqx.field(static=True)
 
     @property
-    def rounding(self) -> Rounding:
-        """As in `Observer`."""
-        return self.inner.rounding
-
-    @property
-    def guaranteed(self) -> bool:
-        """The boxes hold on the machine."""
-        return self.inner.guaranteed
-
-    @property
-    def u_region(self) -> Interval:
-        """Box (m,) of known inputs for which the enclosures hold."""
-        return self.inner.u_region
-
-    @property
-    def current_input_directions(self) -> Any:
-        """V1 (p, p_H)."""
-        return self.inner.current_input_directions
-
-    @property
     def output_rows(self) -> tuple[tuple[int, ...], ...]:
         """For every row of T2 the outputs of the plant that enter it, now or later."""
         l, later = self.system.l, self.lift.rows(np.float64).entries
@@ -83,27 +62,17 @@ class DelayedObserver(eqx.Module):
         assert lift is not None
         return lift
 
-    def with_rounding(self, rounding: Rounding) -> DelayedObserver:
-        """The same observer with another rounding."""
-        return replace(self, inner=self.inner.with_rounding(rounding))
-
     def astype(self, dtype: Any) -> DelayedObserver:
         """The same observer in another floating type; boxes are rounded outward (`Observer.astype`)."""
         dtype = np.dtype(jax.dtypes.canonicalize_dtype(dtype))
-        found = vars(self).get("_typed", {}).get(dtype)
-        if found is None:
+
+        def made() -> DelayedObserver:
             inner = self.inner.astype(dtype)
             self.lift.rows(dtype)  # refused here rather than in the middle of a run
             with jax.ensure_compile_time_eval():  # as in `Observer.astype`
-                found = replace(cast(replace(self, inner=None), dtype), inner=inner)
-            object.__setattr__(self, "_typed", {**vars(self).get("_typed", {}), dtype: found})
-        return found
+                return replace(cast(replace(self, inner=None), dtype), inner=inner)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write every number of the design into a file, as `Observer.save`."""
-        from gsisio_jax.files import save_observer
-
-        save_observer(path, self)
+        return self._once(dtype, made)
 
     def row(self, y: Any, u: Any, noise: Noise) -> tuple[Any, Noise]:
         """Measurement (l',) and noise bounds of the lifted plant for step k, from y, u and noise of k..k+L, (L+1, .).

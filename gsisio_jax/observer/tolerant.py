@@ -7,7 +7,6 @@ kept from step to step is one box for every guess about the last measurement.
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from itertools import combinations
 from typing import Any
@@ -20,20 +19,20 @@ import numpy as np
 from gsisio_jax import scalar
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like
-from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer import step as current_step
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.maps import Maps
 from gsisio_jax.observer.status import Status, bit_mask
 from gsisio_jax.observer.types import Carry, Observer, StepOutput
+from gsisio_jax.observer.wrapped import Wrapped
 from gsisio_jax.plant.system import Noise, System
 
 MOST_GUESSES = 20
 """About one measurement; a step takes the square of it."""
 
 
-class TolerantObserver(eqx.Module):
+class TolerantObserver(Wrapped):
     """A designed observer that is certain while at most q outputs a step are wrong. Made by
     `design_observer(tolerate=q)`.
 
@@ -61,47 +60,13 @@ class TolerantObserver(eqx.Module):
         return self.inner.certificate
 
     @property
-    def rounding(self) -> Rounding:
-        """As in `Observer`."""
-        return self.inner.rounding
-
-    @property
-    def guaranteed(self) -> bool:
-        """The boxes hold on the machine."""
-        return self.inner.guaranteed
-
-    @property
-    def u_region(self) -> Interval:
-        """Box (m,) of known inputs for which the enclosures hold."""
-        return self.inner.u_region
-
-    @property
-    def current_input_directions(self) -> Any:
-        """V1 (p, p_H)."""
-        return self.inner.current_input_directions
-
-    @property
     def output_rows(self) -> tuple[tuple[int, ...], ...]:
         """For every row of T2 the outputs that enter it."""
         return self.inner.output_rows
 
-    def with_rounding(self, rounding: Rounding) -> TolerantObserver:
-        """The same observer with another rounding."""
-        return replace(self, inner=self.inner.with_rounding(rounding))
-
     def astype(self, dtype: Any) -> TolerantObserver:
         """The same observer in another floating type; boxes are rounded outward (`Observer.astype`)."""
-        found = vars(self).get("_typed", {}).get(np.dtype(dtype))
-        if found is None:
-            found = replace(self, inner=self.inner.astype(dtype))
-            object.__setattr__(self, "_typed", {**vars(self).get("_typed", {}), np.dtype(dtype): found})
-        return found
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write every number of the design into a file, as `Observer.save`."""
-        from gsisio_jax.files import save_observer
-
-        save_observer(path, self)
+        return self._once(dtype, lambda: replace(self, inner=self.inner.astype(dtype)))
 
 
 class Guesses(eqx.Module):
