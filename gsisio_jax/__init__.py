@@ -14,7 +14,6 @@ from gsisio_jax.observer.alarms import Alarm
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.estimation import Estimate, estimate, start, step
-from gsisio_jax.observer.mean_input import mean_input
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.status import Status
 from gsisio_jax.observer.tolerant import TolerantObserver
@@ -26,7 +25,7 @@ from gsisio_jax.plant.system import Noise, System
 if TYPE_CHECKING:
     from gsisio_jax import dataset, examples, paper, plot, study, tuning
     from gsisio_jax.continuous import Discretization, discretize, from_state_space
-    from gsisio_jax.design import design_observer
+    from gsisio_jax.design import design_observer, mean_input
     from gsisio_jax.files import load_carry, load_observer, save_carry
     from gsisio_jax.study import grid, monte_carlo, sweep, tightness
     from gsisio_jax.tuning import allocate, tune_noise, width_sensitivity
@@ -93,6 +92,7 @@ _LAZY = {
     "grid": "gsisio_jax.study",
     "load_carry": "gsisio_jax.files",
     "load_observer": "gsisio_jax.files",
+    "mean_input": "gsisio_jax.design",
     "monte_carlo": "gsisio_jax.study",
     "save_carry": "gsisio_jax.files",
     "sweep": "gsisio_jax.study",

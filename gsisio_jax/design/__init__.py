@@ -4,5 +4,6 @@ Small linear ones go to Clarabel directly; cvxpy is imported where it is first n
 """
 
 from gsisio_jax.design.build import design_observer
+from gsisio_jax.design.mean_input import mean_input
 
-__all__ = ["design_observer"]
+__all__ = ["design_observer", "mean_input"]

@@ -9,6 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.design.assemble import Plan
+from gsisio_jax.design.feedthrough import factorise
+from gsisio_jax.design.gain_selection import typical_width, units
+from gsisio_jax.design.input_rows import rows_of_sums
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type
@@ -37,7 +41,9 @@ def mean_input(
     Args:
         observer: from `design_observer`, in the current form, without a delay and without periodic outputs.
         estimate: what `gsisio_jax.estimate` returned for this record.
-        y, u, noise: the record and the bounds that it was called with, (T, l), (T, m).
+        y: measurements (T, l) that it was called with.
+        u: its known inputs (T, m).
+        noise: its bounds; None takes those of the design.
         steps: m >= 1, below T.
 
     Returns:
@@ -86,11 +92,6 @@ def _by_row(box: Interval, T: int) -> Interval:
 
 
 def _rows(observer: Observer, steps: int) -> InputRows | None:
-    from gsisio_jax.design.assemble import Plan
-    from gsisio_jax.design.feedthrough import factorise
-    from gsisio_jax.design.gain_selection import typical_width, units
-    from gsisio_jax.design.input_rows import rows_of_sums
-
     system, certificate = observer.system, observer.certificate
     feedthrough = factorise(np.asarray(system.H))
     slopes = slopes_of(system, feedthrough.T2, observer.u_region)(certificate.region)
