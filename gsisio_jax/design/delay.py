@@ -101,7 +101,8 @@ def _with_more(
 def _delayed(inner: Observer, system: System, noise: Noise, u_region: Interval, delay: int) -> DelayedObserver:
     """The observer in terms of the plant."""
     rows = _rows(inner.system)
-    observer = DelayedObserver(system, noise, _certificate(inner.certificate, rows, system, delay), inner, delay)
+    certificate = _certificate(inner.certificate, rows, system, delay)
+    observer = DelayedObserver(system=system, noise=noise, certificate=certificate, inner=inner, delay=delay)
     steady = inner.certificate.steady_width
     if inner.certificate.recoverable is None or not np.isfinite(steady).all():
         return observer
