@@ -13,7 +13,7 @@ import numpy as np
 from gsisio_jax.continuous import sides
 from gsisio_jax.continuous.sides import Sides
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.reading import check_type, read_array
+from gsisio_jax.interval.reading import check_type, is_whole, read_array
 
 METHODS = ("euler", "rk4", "taylor", "zoh")
 
@@ -127,7 +127,7 @@ def _step(dt: Any) -> float:
 def _order(method: str, order: Any) -> int:
     if method not in METHODS:
         raise ValueError(f"discretize: `method` must be one of {', '.join(METHODS)}; got {method!r}")
-    if isinstance(order, bool) or not isinstance(order, int | np.integer) or order < 1:
+    if not is_whole(order) or order < 1:
         raise ValueError(f"discretize: `order` must be an integer from 1 on, got {order!r}")
     return {"euler": 1, "rk4": 4, "taylor": int(order), "zoh": 1}[method]
 

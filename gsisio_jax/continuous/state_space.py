@@ -10,7 +10,7 @@ import numpy as np
 
 from gsisio_jax.continuous import maps
 from gsisio_jax.continuous.hold import held
-from gsisio_jax.interval.reading import read_array
+from gsisio_jax.interval.reading import is_whole, read_array
 from gsisio_jax.plant.system import System
 
 _CALL = "from_state_space"
@@ -129,7 +129,7 @@ def _unknown(G: Any, H: Any, n: int, l: int) -> tuple[np.ndarray, np.ndarray]:
 def _columns(unknown: Sequence[int], m: int) -> list[int]:
     columns = list(unknown)
     for j in columns:
-        if isinstance(j, bool) or not isinstance(j, int | np.integer) or not 0 <= j < m:
+        if not is_whole(j) or not 0 <= j < m:
             raise ValueError(f"{_CALL}: `unknown` must hold indices of inputs, 0 to {m - 1}, got {unknown!r}")
     if len(set(columns)) < len(columns):
         raise ValueError(f"{_CALL}: `unknown` names an input twice: {unknown!r}")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.reading import check_type
+from gsisio_jax.interval.reading import check_type, is_whole
 from gsisio_jax.observer.checks import refuse_input_model
 from gsisio_jax.plant.system import Noise, System
 
@@ -38,7 +38,7 @@ def checked(
         raise ValueError(f'design_observer: `form` must be "current" or "prediction", got {form!r}')
     system.check_unchanged("design_observer")
     for name, count, other in (("gains", gains, ' or "auto"'), ("sweeps", sweeps, "")):
-        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
+        whole = is_whole(count)
         if not (whole and int(count) >= 1) and not (other and isinstance(count, str) and count == "auto"):
             raise ValueError(f"design_observer: `{name}` must be a whole number, at least 1{other}, got {count!r}")
     if progress is not None and not isinstance(progress, bool | np.bool_):
@@ -46,7 +46,7 @@ def checked(
     for name, flag in (("missing", missing), ("certify", certify)):
         if not isinstance(flag, bool | np.bool_):
             raise ValueError(f"design_observer: `{name}` must be True or False, got {flag!r}")
-    steps = window if isinstance(window, int | np.integer) and not isinstance(window, bool) else 0
+    steps = window if is_whole(window) else 0
     if window != "auto" and steps < 1:
         raise ValueError(
             f'design_observer: `window` must be a whole number of steps, at least 1, or "auto", got {window!r}'
@@ -99,7 +99,7 @@ def check_cells(cells: Any, form: str) -> None:
     Raises:
         ValueError: it is not.
     """
-    whole = isinstance(cells, int | np.integer) and not isinstance(cells, bool)
+    whole = is_whole(cells)
     if not whole or not 1 <= cells <= _MOST_CELLS:
         raise ValueError(
             f"design_observer: `cells` must be a whole number, 1 (the box as a whole) to {_MOST_CELLS}, got {cells!r}"

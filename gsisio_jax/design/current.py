@@ -78,6 +78,7 @@ def design_current(
     """The current form, its arguments checked; `given` is the region, or None and it is looked for around `near`."""
     say("bounding slopes")
     feedthrough = factorise(np.asarray(system.H))
+    plan = Plan(system, noise, feedthrough, u_region)
     slopes_on = slopes_of(system, feedthrough.T2, u_region)
     everywhere = slopes_on(system.state_bounds)
     try:
@@ -85,9 +86,8 @@ def design_current(
     except ObserverDoesNotExist as error:
         say("looking for what would help")
         reason = with_delay(error, system, u_region)
-        ways = what_helps(Plan(system, noise, feedthrough, u_region), slopes_on, near if given is None else given)
+        ways = what_helps(plan, slopes_on, near if given is None else given)
         raise type(reason)(f"{reason}{ways}") from None
-    plan = Plan(system, noise, feedthrough, u_region)
     say("looking for a region")
     box = _found_region(plan, slopes_on, dials.certify, near) if given is None else given
     say("choosing gains")

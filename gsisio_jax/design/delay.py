@@ -16,6 +16,7 @@ from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.shared_noise import combinations
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import is_whole
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.enclosures import slopes_of
@@ -33,7 +34,7 @@ def check_delay(delay: Any, system: System, form: str) -> bool:
     Raises:
         ValueError: it is no whole number, or goes with nothing.
     """
-    whole = isinstance(delay, int | np.integer) and not isinstance(delay, bool)
+    whole = is_whole(delay)
     if not (whole and delay >= 0) and not (isinstance(delay, str) and delay == "auto"):
         raise ValueError(
             f'design_observer: `delay` must be a whole number of steps, at least 0, or "auto", got {delay!r}'

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import is_whole
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.enclosures import Slopes
 from gsisio_jax.observer.slice_bounds import slices_of
@@ -22,7 +23,7 @@ _GAIN = 0.98  # share of a width below which more slices are worth their operati
 
 def check_split(split: Any, form: str) -> None:
     """Raises ValueError where `split` is no number of slices, or goes with nothing."""
-    whole = isinstance(split, int | np.integer) and not isinstance(split, bool)
+    whole = is_whole(split)
     if not (whole and split >= 1) and not (isinstance(split, str) and split == "auto"):
         raise ValueError(f'design_observer: `split` must be a number of slices, at least 1, or "auto", got {split!r}')
     if form == "prediction" and split != 1:

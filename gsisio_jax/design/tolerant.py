@@ -16,6 +16,7 @@ from gsisio_jax.design.gains import profile_gain
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import is_whole
 from gsisio_jax.observer.checks import refuse_input_model
 from gsisio_jax.observer.recovery import Recovery
 from gsisio_jax.observer.recovery_constants import AffineMaps
@@ -32,7 +33,7 @@ def check_tolerate(tolerate: Any, system: System, form: str, missing: bool, wind
     Raises:
         ValueError: it is no whole number, leaves no output, takes too many guesses, or goes with nothing.
     """
-    l, whole = system.l, isinstance(tolerate, int | np.integer) and not isinstance(tolerate, bool)
+    l, whole = system.l, is_whole(tolerate)
     if not whole or tolerate < 0:
         raise ValueError(f"design_observer: `tolerate` must be a whole number of outputs, at least 0, got {tolerate!r}")
     if tolerate == 0:

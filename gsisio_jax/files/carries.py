@@ -15,7 +15,7 @@ from gsisio_jax.files.once import once_per_observer
 from gsisio_jax.files.systems import described, differing_maps
 from gsisio_jax.files.tree import encode
 from gsisio_jax.interval.box import Interval, is_concrete
-from gsisio_jax.interval.reading import check_type
+from gsisio_jax.interval.reading import check_type, is_whole
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.scan import blank
 from gsisio_jax.observer.types import Carry
@@ -39,7 +39,7 @@ def save_carry(path: str | os.PathLike[str], carry: Carry, observer: AnyObserver
     call = "save_carry"
     check_type(call, "carry", carry, Carry, "it comes from gx.start, and then from every gx.step")
     check_type(call, "observer", observer, AnyObserver.__args__, _OBSERVER)
-    if isinstance(step, bool) or not isinstance(step, int | np.integer) or step < 0:
+    if not is_whole(step) or step < 0:
         raise ValueError(f"{call}: `step` must be a number of measurements, at least 0, got {step!r}")
     if not all(map(is_concrete, jax.tree.leaves(carry))):
         raise ValueError(f"{call}: `carry` is traced by JAX, but a file needs its numbers; save it outside of jit")

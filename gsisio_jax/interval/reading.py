@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Set
 from decimal import Decimal
 from numbers import Integral, Real
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeGuard
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,11 @@ def read_array(call: str, name: str, value: Any, missing: bool = False) -> Any:
         return _numbers(value, missing)
     except _Refused as error:
         raise ValueError(f"{call}: `{name}` must be an array of real numbers, got {error}") from None
+
+
+def is_whole(value: Any) -> TypeGuard[int]:
+    """A whole number, of Python or of NumPy; True and False are none."""
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def check_type(call: str, name: str, value: Any, kinds: type | tuple[type, ...], remedy: str = "") -> None:

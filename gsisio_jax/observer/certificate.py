@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.reading import check_type
+from gsisio_jax.interval.reading import check_type, is_whole
 from gsisio_jax.plant.system import Noise
 
 
@@ -182,7 +182,7 @@ class Certificate(eqx.Module):
         Raises:
             ValueError: `lost` is no such number, or recovery was not examined (``missing=False`` in the design).
         """
-        if lost is not None and (isinstance(lost, bool) or not isinstance(lost, int | np.integer) or lost < 1):
+        if lost is not None and (not is_whole(lost) or lost < 1):
             raise ValueError(
                 f"rows_until_finite: `lost` must be a number of rows, at least 1, or None (any state), got {lost!r}"
             )

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.reading import read_array
+from gsisio_jax.interval.reading import is_whole, read_array
 
 
 def read_rate(value: Any, p: int) -> Interval | None:
@@ -37,7 +37,7 @@ def read_constant(value: Any, p: int) -> int | None:
     if value is None:
         return None
     _check_some("input_constant", p)
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+    if not is_whole(value) or value < 1:
         raise ValueError(
             f"System: `input_constant` must be a whole number of steps of at least 1, got {value!r}; for an input that "
             f"never changes give input_rate={[0.0] * p}"

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.reading import check_type, read_array
+from gsisio_jax.interval.reading import check_type, is_whole, read_array
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 Periods = tuple[tuple[int, float], ...]
@@ -36,7 +36,7 @@ def read_periods(name: str, given: Mapping[int, float] | None, size: int, what: 
         )
     found = []
     for index, period in given.items():
-        if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < size:
+        if not is_whole(index) or not 0 <= index < size:
             raise ValueError(
                 f"System: `{name}` has the index {index!r}; it must be that of one of the {size} {what}s, 0 to "
                 f"{size - 1}"

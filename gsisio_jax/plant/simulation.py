@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gsisio_jax.interval.box import Interval, is_concrete
-from gsisio_jax.interval.reading import check_type, read_array
+from gsisio_jax.interval.reading import check_type, is_whole, read_array
 from gsisio_jax.plant.periodic import wrapped_outputs
 from gsisio_jax.plant.system import Noise, System
 
@@ -80,7 +80,7 @@ def read_key(call: str, key: Any) -> Any:
     Raises:
         ValueError: it is neither.
     """
-    if isinstance(key, int | np.integer) and not isinstance(key, bool):
+    if is_whole(key):
         return jax.random.key(int(key))
     if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0:
         return key
