@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, NamedTuple
 
@@ -40,7 +39,7 @@ from gsisio_jax.design.window import window_rows
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.cells import counts
-from gsisio_jax.observer.enclosures import Slopes, first_form, slopes_of
+from gsisio_jax.observer.enclosures import Enclosures, Slopes
 from gsisio_jax.observer.recovery_constants import AffineMaps
 from gsisio_jax.observer.rounding_constants import with_rounding_constants
 from gsisio_jax.observer.types import Observer
@@ -79,23 +78,23 @@ def design_current(
     say("bounding slopes")
     feedthrough = factorise(np.asarray(system.H))
     plan = Plan(system, noise, feedthrough, u_region)
-    slopes_on = slopes_of(system, feedthrough.T2, u_region)
-    everywhere = slopes_on(system.state_bounds)
+    on = Enclosures.of(system, feedthrough.T2, u_region)
+    everywhere = on.slopes(system.state_bounds)
     try:
         check_existence(system, feedthrough, everywhere)
     except ObserverDoesNotExist as error:
         say("looking for what would help")
         reason = with_delay(error, system, u_region)
-        ways = what_helps(plan, slopes_on, near if given is None else given)
+        ways = what_helps(plan, on, near if given is None else given)
         raise type(reason)(f"{reason}{ways}") from None
     say("looking for a region")
-    box = _found_region(plan, slopes_on, dials.certify, near) if given is None else given
+    box = _found_region(plan, on, dials.certify, near) if given is None else given
     say("choosing gains")
-    first = first_gain(plan, slopes_on, box, dials.certify)
+    first = first_gain(plan, on, box, dials.certify)
     problem, main = first.problem, first.gain
     say("bounding unknown inputs")
     maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
-    outputs, slack = first_form(system, feedthrough.T2, u_region)
+    outputs, slack = on.outputs(system.state_bounds)
 
     def assembled(gains: list[np.ndarray], scale: np.ndarray) -> Observer:
         inputs = input_bounds(problem, scale)
@@ -129,11 +128,11 @@ def design_current(
         observer = replace(observer, certificate=observer.certificate.without_promise(first.uncertified))
     elif dials.split != 1 and not everywhere.affine:
         weights = np.asarray(observer.gains.residual[0])
-        certificate = with_slices(observer.certificate, noise, weights, slopes_on, box, dials.split)
+        certificate = with_slices(observer.certificate, noise, weights, on.slopes, box, dials.split)
         observer = replace(observer, certificate=certificate)
     observer = replace(observer, cells=counts(dials.cells, everywhere.bent_outputs))
     if not (first.uncertified or observer.certificate.certified):
-        way = what_settles(plan, slopes_on, box)
+        way = what_settles(plan, on, box)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))
     if not everywhere.affine:
         found = (undefined_in(system, box, u_region), grown_around(near, box) if given is None else "")
@@ -158,7 +157,7 @@ def design_current(
         try:
             check_initial_contraction(problem, bank[0], observer, outputs)
         except NoDesignFound as error:
-            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, box)}") from None
+            raise NoDesignFound(f"{error}{what_helps(plan, on, box)}") from None
     if dials.tolerate:
         return tolerant(observer, dials.tolerate)
     if not dials.missing:
@@ -166,19 +165,17 @@ def design_current(
     say("trying what happens after a lost row")
     certificate = with_recovery(observer, width, u_region)
     if certificate.recoverable is False:
-        certificate = certificate.with_notes(what_recovers(plan, slopes_on, box))
+        certificate = certificate.with_notes(what_recovers(plan, on, box))
     return replace(observer, certificate=certificate)
 
 
-def _found_region(
-    plan: Plan, slopes_on: Callable[[Interval], Slopes], certify: bool, near: Interval | None
-) -> Interval:
+def _found_region(plan: Plan, on: Enclosures, certify: bool, near: Interval | None) -> Interval:
     """region="auto"; where there is none and no certificate is asked for, the point that the search began at."""
     try:
-        return find_region(plan.system, lambda box: _steady_width(plan, box, slopes_on(box)), near)
+        return find_region(plan.system, lambda box: _steady_width(plan, box, on.slopes(box)), near)
     except NoDesignFound as error:
         if certify:
-            raise NoDesignFound(f"{error}{what_helps(plan, slopes_on, near)}") from None
+            raise NoDesignFound(f"{error}{what_helps(plan, on, near)}") from None
         if near is not None:
             return near
         center = np.asarray(plan.system.state_bounds.center, np.float64)

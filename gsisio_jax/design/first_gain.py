@@ -6,7 +6,7 @@ finite at all. Where only the promise is lost, the design goes on without it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.inclusion.culprits import Culprit, culprits
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer.enclosures import Slopes
+from gsisio_jax.observer.enclosures import Enclosures, Slopes
 
 _HALVINGS, _BISECTIONS = 10, 5  # of the region, in search of a scale at which a design exists
 
@@ -44,12 +44,12 @@ class FirstGain:
     uncertified: str
 
 
-def first_gain(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval, certify: bool) -> FirstGain:
+def first_gain(plan: Plan, on: Enclosures, region: Interval, certify: bool) -> FirstGain:
     """The certified gain of the region, or one without a certificate.
 
     Args:
         plan: plant, noise, feedthrough and known inputs.
-        slopes_on: from `slopes_of`.
+        on: its enclosures.
         region: of the design.
         certify: refuse where a certificate cannot be had on this region, but might on another one. Jumps of f and g
             rule it out on every region that holds them, so they are no reason to refuse.
@@ -57,7 +57,7 @@ def first_gain(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Inte
     Raises:
         NoDesignFound: says which operation, or which direction of the input, is the reason, and what may help.
     """
-    slopes, uncertified = slopes_on(region), ""
+    slopes, uncertified = on.slopes(region), ""
     problem = plan.problem(slopes) if slopes.finite else plan.problem(_at_center(plan, region, slopes))
     if not slopes.finite:
         found = _culprits(plan, region)
@@ -67,7 +67,7 @@ def first_gain(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Inte
             raise NoDesignFound(
                 f"design_observer: the derivatives of f or g are not bounded on the region {region}: "
                 f"{reason}. Give a region (or `state_bounds`) that keeps away from such points, or "
-                f"design without a certificate: certify=False.{_scaled(plan, slopes_on, region)}"
+                f"design without a certificate: certify=False.{_scaled(plan, on, region)}"
             )
     try:
         check_rank(problem)
@@ -75,7 +75,7 @@ def first_gain(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Inte
     except NoDesignFound as error:
         if certify:
             hint = " certify=False gives an observer without a certificate."
-            hint += _scaled(plan, slopes_on, region) + what_helps(plan, slopes_on, region)
+            hint += _scaled(plan, on, region) + what_helps(plan, on, region)
             raise NoDesignFound(f"{error}{hint}") from None
         gain, uncertified = _any_gain(problem), f"no width is promised: {error}"
     return FirstGain(problem, slopes, gain, uncertified)
@@ -125,7 +125,7 @@ def _any_gain(problem: GainProblem) -> np.ndarray:
     return np.where((left <= 1e-12 * np.abs(target).max(initial=1.0))[:, None], rows, 0.0)
 
 
-def _scaled(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> str:
+def _scaled(plan: Plan, on: Enclosures, region: Interval) -> str:
     """The largest multiple of the region about its centre for which a gain exists, as a hint, or that there
     is none; "" where the region is unbounded or a point."""
     lower, upper = (np.asarray(side, np.float64) for side in (region.lower, region.upper))
@@ -136,10 +136,8 @@ def _scaled(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interva
     def of(scale: float) -> Interval:
         return Interval(center - scale * radius, center + scale * radius)
 
-    everywhere = slopes_on(plan.system.state_bounds)
-
     def works(scale: float, contracts: bool) -> bool:
-        slopes = slopes_on(of(scale))
+        slopes = on.slopes(of(scale))
         if not slopes.finite:
             return False
         problem = plan.problem(slopes)
@@ -148,7 +146,7 @@ def _scaled(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interva
             gain = main_gain(problem, of(scale))
         except NoDesignFound:
             return False
-        if not starts(plan, problem, gain, slopes, everywhere):
+        if not starts(plan, problem, gain, slopes, on):
             return False
         return not contracts or bool(np.isfinite(problem.steady_width(gain)).all())
 

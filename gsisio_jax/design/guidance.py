@@ -22,7 +22,7 @@ from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.certificate import spectral_radius
-from gsisio_jax.observer.enclosures import Slopes, affine_on_state_bounds
+from gsisio_jax.observer.enclosures import Enclosures, Slopes
 from gsisio_jax.plant.system import Noise
 
 _MOST = 12  # candidates of a kind: plants with more states are told of the first ones
@@ -39,6 +39,7 @@ class Changed:
         index: of the state or the input.
         plan: of the changed plant.
         region, everywhere: enclosures of its slopes on the region and on the state bounds.
+        outputs: affine bounds of T2 g of the plant as it is, on a box (`Enclosures`).
     """
 
     kind: str
@@ -46,21 +47,22 @@ class Changed:
     plan: Plan
     region: Slopes
     everywhere: Slopes
+    outputs: Callable[[Interval], Any]
 
 
-def what_helps(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval | None) -> str:
+def what_helps(plan: Plan, on: Enclosures, region: Interval | None) -> str:
     """Lines that say which further sensor or bound makes a design possible; each was tried.
 
     Args:
         plan: of the plant that has none.
-        slopes_on: from `slopes_of`.
+        on: its enclosures.
         region: of the design; None where it was to be found.
     """
     region = _place(plan, region)
-    if not slopes_on(region).finite:
+    if not on.slopes(region).finite:
         return ""
     found: dict[tuple[str, bool], list[int]] = {}
-    for one in _changes(plan, slopes_on, region):
+    for one in _changes(plan, on, region):
         verdict = _verdict(one)
         if verdict is not None:
             found.setdefault((one.kind, verdict), []).append(one.index)
@@ -73,26 +75,26 @@ def what_helps(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Inte
     return "\nTried one by one, each of these is enough:\n" + ";\n".join(lines) + "."
 
 
-def what_settles(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> str:
+def what_settles(plan: Plan, on: Enclosures, region: Interval) -> str:
     """Which further sensor or bound makes widths settle where they do not; "" where none of them alone does."""
-    return _one_of("widths would settle", plan, slopes_on, region, lambda one: _verdict(one) is True)
+    return _one_of("widths would settle", plan, on, region, lambda one: _verdict(one) is True)
 
 
-def what_recovers(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> str:
+def what_recovers(plan: Plan, on: Enclosures, region: Interval) -> str:
     """Which further sensor or bound makes boxes finite again after a lost row; "" where none of them alone does."""
-    found = _one_of("after a lost row boxes would become finite again", plan, slopes_on, region, _recovers)
+    found = _one_of("after a lost row boxes would become finite again", plan, on, region, _recovers)
     return found or "after a lost row no single further sensor or bound makes boxes finite again (tried)"
 
 
 def _one_of(
     what: str,
     plan: Plan,
-    slopes_on: Callable[[Interval], Slopes],
+    on: Enclosures,
     region: Interval,
     works: Callable[[Changed], bool],
 ) -> str:
     found: dict[str, list[int]] = {}
-    for one in _changes(plan, slopes_on, region):
+    for one in _changes(plan, on, region):
         if works(one):
             found.setdefault(one.kind, []).append(one.index)
     ways = "; or ".join(_words(kind, members) for kind, members in found.items())
@@ -107,9 +109,10 @@ def _words(kind: str, members: list[int]) -> str:
     return f"`{kind}` with two finite sides for {kind.removesuffix('_bounds')} {which}"
 
 
-def starts(plan: Plan, problem: GainProblem, gain: np.ndarray, here: Slopes, everywhere: Slopes) -> bool:
+def starts(plan: Plan, problem: GainProblem, gain: np.ndarray, here: Slopes, on: Enclosures) -> bool:
     """Would the first box of a step be finite with this gain of the plant as it is?"""
-    return _starts(Changed("nothing", 0, plan, here, everywhere), problem, gain)
+    everywhere = on.slopes(plan.system.state_bounds)
+    return _starts(Changed("nothing", 0, plan, here, everywhere, on.outputs), problem, gain)
 
 
 def _place(plan: Plan, region: Interval | None) -> Interval:
@@ -117,10 +120,10 @@ def _place(plan: Plan, region: Interval | None) -> Interval:
     return Interval(center, center) if region is None else region
 
 
-def _changes(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> Iterator[Changed]:
+def _changes(plan: Plan, on: Enclosures, region: Interval) -> Iterator[Changed]:
     system = plan.system
     bounds, known = system.state_bounds, system.input_bounds
-    here, everywhere = slopes_on(region), slopes_on(bounds)
+    here, everywhere = on.slopes(region), on.slopes(bounds)
     if not here.finite:
         return
     n, p = system.n, system.p
@@ -140,16 +143,19 @@ def _changes(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interv
             ),
             _with_row(here, i),
             _with_row(everywhere, i),
+            on.outputs,
         )
     for j in np.flatnonzero(~np.isfinite(np.asarray(known.width)))[:_MOST]:
         box = _bounded(known, j, -1.0, 1.0)
-        yield Changed("input_bounds", int(j), replace(plan, system=_like(plan, input_bounds=box)), here, everywhere)
+        changed = replace(plan, system=_like(plan, input_bounds=box))
+        yield Changed("input_bounds", int(j), changed, here, everywhere, on.outputs)
     for i in np.flatnonzero(~np.isfinite(np.asarray(bounds.width)))[:_MOST]:
         low, high = float(region.lower[i]), float(region.upper[i])
         if not (np.isfinite([low, high]).all() and low < high):
             low, high = low - 1.0 if np.isfinite(low) else -1.0, high + 1.0 if np.isfinite(high) else 1.0
         box = _bounded(bounds, i, low, high)
-        yield Changed("state_bounds", int(i), replace(plan, system=_like(plan, state_bounds=box)), here, slopes_on(box))
+        changed = replace(plan, system=_like(plan, state_bounds=box))
+        yield Changed("state_bounds", int(i), changed, here, on.slopes(box), on.outputs)
 
 
 def _like(plan: Plan, **changes: Any) -> Any:
@@ -209,17 +215,13 @@ def _starts(one: Changed, problem: GainProblem, gain: np.ndarray) -> bool:
 
 def _first_form(one: Changed) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (q, n) of the affine bounds of T2 g on the state bounds, and which of them have a finite remainder."""
-    system, T2 = one.plan.system, one.plan.feedthrough.T2
     if one.everywhere.near_affine(one.everywhere.Z_radius):
-        return one.everywhere.Z, np.full(len(T2), True)
-    inner = T2[:-1, :-1] if one.kind == "sensor" else T2
-    form, _ = affine_on_state_bounds(
-        lambda x, u: inner @ system.measurement(x, u), system, one.plan.u_region, np.float64
-    )
+        return one.everywhere.Z, np.full(len(one.everywhere.Z), True)
+    form, _ = one.outputs(one.plan.system.state_bounds)
     slope = np.asarray(form.slope, np.float64)
     finite = np.isfinite(form.offset.lower) & np.isfinite(form.offset.upper)
     if one.kind == "sensor":
-        return np.vstack([slope, np.eye(system.n)[one.index]]), np.append(finite, True)
+        return np.vstack([slope, np.eye(slope.shape[1])[one.index]]), np.append(finite, True)
     return slope, finite
 
 

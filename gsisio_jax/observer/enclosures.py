@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -75,6 +75,22 @@ def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) ->
     return on
 
 
+class Enclosures(NamedTuple):
+    """What is known of a plant on a box of states, uniformly over a box of known inputs; traced once for all boxes.
+
+    Attributes:
+        slopes: from `slopes_of`.
+        outputs: from `outputs_of`.
+    """
+
+    slopes: Callable[..., Slopes]
+    outputs: Callable[[Interval], tuple[AffineForm, np.ndarray]]
+
+    @staticmethod
+    def of(system: Any, T2: Any, u_region: Interval) -> Enclosures:
+        return Enclosures(slopes_of(system, T2, u_region), outputs_of(system, T2, u_region))
+
+
 def known(box: Interval, dtype: Any) -> Interval:
     """`Interval.astype` in NumPy: JAX would compile each of its operations by itself."""
     lower, upper = (np.asarray(side) for side in (box.lower, box.upper))
@@ -97,22 +113,35 @@ def _center_and_distance(jacobian: Interval) -> tuple[np.ndarray, np.ndarray]:
     return center, np.where(lower == upper, 0.0, np.nextafter(radius, np.inf))
 
 
-def first_form(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> tuple[AffineForm, np.ndarray]:
-    """Affine bounds of T2 g on the state bounds, uniformly over `u_region`, and the slack of their slope (q, n): every
-    step begins with them.
+def outputs_of(
+    system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64
+) -> Callable[[Interval], tuple[AffineForm, np.ndarray]]:
+    """Affine bounds of T2 g on a box of states, uniformly over `u_region`, and the slack of their slope (q, n): every
+    step begins with those on the state bounds.
 
     Source: theory 5.3.
     """
     matrix = np.asarray(T2, dtype)
-    return affine_on_state_bounds(lambda x, u: matrix @ system.measurement(x, u), system, u_region, dtype)
+    return affine_of(lambda x, u: matrix @ system.measurement(x, u), u_region, dtype)
 
 
-def affine_on_state_bounds(
-    function: Callable[..., Any], system: Any, u_region: Interval, dtype: Any
-) -> tuple[AffineForm, np.ndarray]:
-    """Affine bounds of a function of x and u on the state bounds, uniformly over `u_region`, and the slack of their
-    slope (q, n)."""
-    with _able_to_hold(dtype):
-        bounds, u_box = known(system.state_bounds, dtype), known(u_region, dtype)
-        form, slack = numpy_function(affine_with_slack(function), bounds, u_box)(bounds, u_box)
-        return form, np.asarray(slack, np.float64)
+def affine_of(
+    function: Callable[..., Any], u_region: Interval, dtype: Any
+) -> Callable[[Interval], tuple[AffineForm, np.ndarray]]:
+    """Affine bounds of a function of x and u as a function of the box of x, uniformly over `u_region`, and the slack of
+    their slope (q, n); traced once for all boxes, as in `slopes_of`, and computed once for each."""
+    program: list[Callable[..., Any]] = []
+    found: dict[bytes, tuple[AffineForm, np.ndarray]] = {}
+
+    def on(box: Interval) -> tuple[AffineForm, np.ndarray]:
+        with _able_to_hold(dtype):
+            boxes = known(box, dtype), known(u_region, dtype)
+            key = boxes[0].lower.tobytes() + boxes[0].upper.tobytes()
+            if key not in found:
+                if not program:
+                    program.append(numpy_function(affine_with_slack(function), *boxes))
+                form, slack = program[0](*boxes)
+                found[key] = form, np.asarray(slack, np.float64)
+            return found[key]
+
+    return on

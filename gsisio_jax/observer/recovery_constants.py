@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval, magnitude
-from gsisio_jax.observer.enclosures import affine_on_state_bounds
+from gsisio_jax.observer.enclosures import affine_of
 from gsisio_jax.observer.recovery import Recovery
 
 _UP = 1 + 1e-9  # covers float64 sums of nonnegative numbers
@@ -44,7 +44,7 @@ class AffineMaps:
             return jnp.concatenate([f, g, T2 @ g])
 
         nothing = np.zeros(system.m, dtype)
-        form, slack = affine_on_state_bounds(maps, system, Interval.unchecked(nothing, nothing), dtype)
+        form, slack = affine_of(maps, Interval.unchecked(nothing, nothing), dtype)(system.state_bounds)
         slope, lower, upper = (np.asarray(x, np.float64) for x in (form.slope, form.offset.lower, form.offset.upper))
         if not all(np.isfinite(x).all() for x in (slope, slack, lower, upper)):
             return None

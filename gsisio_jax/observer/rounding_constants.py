@@ -19,7 +19,7 @@ from gsisio_jax.inclusion.transforms import AffineForm
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.certificate import spectral_radius
-from gsisio_jax.observer.enclosures import Slopes, first_form, known, slopes_of
+from gsisio_jax.observer.enclosures import Slopes, known, outputs_of, slopes_of
 from gsisio_jax.observer.recovery_constants import AffineMaps, with_constants
 from gsisio_jax.observer.residuals import (
     cancellation_residual,
@@ -74,8 +74,9 @@ def single_precision(observer: Observer) -> Observer:
     slopes = slopes_of(system, narrow.T2, u_region, np.float32)
     region = slopes(observer.certificate.region)
     affine = AffineMaps.of(system, narrow.T2, np.float32) if observer.recovery else None
+    outputs = outputs_of(system, narrow.T2, u_region, np.float32)
     found = with_rounding_constants(
-        narrow, system, region, slopes(system.state_bounds), *first_form(system, narrow.T2, u_region, np.float32),
+        narrow, system, region, slopes(system.state_bounds), *outputs(system.state_bounds),
         affine, np.float32, _slices(narrow, slopes),
     )  # fmt: skip
     return jax.tree.map(lambda x: jnp.asarray(x, np.float32), found)
@@ -98,7 +99,7 @@ def with_rounding_constants(
         observer: with all arrays in NumPy, in `dtype` but for those that are filled in here.
         plant: the system as it was given, in float64.
         region, everywhere: enclosures of the derivatives on the region and on the state bounds.
-        form, slack: from `first_form`.
+        form, slack: from `outputs_of`.
         affine: bounds that rows of recovery stand on; needed where there are any.
         dtype: float64 or float32.
         slices: slopes of the certified gain on parts of the region.
