@@ -12,7 +12,7 @@
 Source: theory 9.
 """
 
-from gsisio_jax.inclusion.interpreter import register_bounds
+from gsisio_jax.inclusion.by_hand import register_bounds
 from gsisio_jax.inclusion.intersection import METHODS, bound
 from gsisio_jax.inclusion.mixed_monotone import (
     decomposition,

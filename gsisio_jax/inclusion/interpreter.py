@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -21,21 +20,10 @@ import numpy as np
 from jax.core import Tracer
 
 from gsisio_jax.inclusion import one_variable
+from gsisio_jax.inclusion.by_hand import BY_HAND, apply_by_hand
 from gsisio_jax.inclusion.form_arithmetic import fold, is_known, known_if_concrete
-from gsisio_jax.inclusion.node import (
-    POINT_MODE,
-    Form,
-    Node,
-    as_node,
-    chain,
-    is_node,
-    jac_of,
-    join,
-    normalise,
-    normalised,
-    parts,
-    slope_of,
-)
+from gsisio_jax.inclusion.loops import kept_loop, stack
+from gsisio_jax.inclusion.node import as_node, is_node, normalise, normalised
 from gsisio_jax.inclusion.origin import remember, settled
 from gsisio_jax.inclusion.rules import comparison, linear, patterns
 from gsisio_jax.inclusion.rules.indexing import TooManyPlacesError
@@ -44,7 +32,6 @@ from gsisio_jax.inclusion.rules.piecewise import by_pieces
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
 from gsisio_jax.inclusion.turns import TurnsError, while_loop
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval
 from gsisio_jax.scalar.unroll import called_jaxpr, numbers_in
 
 # Longer loops, and loops over more operations, are kept as loops: compile time grows with every unrolled turn.
@@ -78,7 +65,7 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
             continue
         try:
             operands, rule = [read(atom) for atom in eqn.invars if place not in bent], None
-            match = known.get(place) if eqn.primitive.name not in _BY_HAND else None
+            match = known.get(place) if eqn.primitive.name not in BY_HAND else None
             given = [read(atom) for atom in match.operands] if match is not None else []
             out = _recognised(match, given)
             if out is None:
@@ -123,9 +110,9 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
     name = eqn.primitive.name
     if not any(is_node(arg) for arg in args):
         return _call(eqn, *args) if CALLS.get(name) is _call else _constant(eqn, args)
-    by_hand = _BY_HAND.get(name) or _BY_HAND.get(eqn.params.get("name"))
+    by_hand = BY_HAND.get(name) or BY_HAND.get(eqn.params.get("name"))
     if by_hand is not None:
-        value = normalise(_apply_by_hand(by_hand, [normalised(arg) for arg in args]))
+        value = normalise(apply_by_hand(by_hand, [normalised(arg) for arg in args]))
         return [value] if eqn.primitive.multiple_results else value
     if name in CALLS:
         return CALLS[name](eqn, *args)
@@ -225,95 +212,21 @@ def _scan(eqn: Any, *args: Any) -> Any:
         return list(out[:n_carry]), list(out[n_carry:])
 
     if length > _UNROLL or (length > 1 and length * numbers_in(body.jaxpr) > _UNROLLED_NUMBERS):
-        return _loop(turn, carry, xs, length, reverse)
+        return kept_loop(turn, carry, xs, length, reverse)
     stacked: list[Any] = [None] * length
     for i in range(length)[::-1] if reverse else range(length):
         carry, stacked[i] = turn(carry, [linear.move(lambda v, i=i: v[i], x) for x in xs])
-    return [*carry, *(_stack(list(column)) for column in zip(*stacked, strict=True))]
+    return [*carry, *(stack(list(column)) for column in zip(*stacked, strict=True))]
 
 
 def _while(eqn: Any, *args: Any) -> list[Any]:
     def loop(turn: Callable[..., list[Any]], carry: list[Any], count: int) -> list[Any]:
-        return _loop(lambda carry, rows: (turn(carry), []), list(carry), [], count, False)
+        return kept_loop(lambda carry, rows: (turn(carry), []), list(carry), [], count, False)
 
     def longest(body: Any) -> int:
         return min(_UNROLL, max(1, _UNROLLED_NUMBERS // max(numbers_in(body), 1)))
 
     return while_loop(eqn, args, evaluate, loop, longest)
-
-
-def _stack(rows: list[Any]) -> Any:
-    if any(is_node(row) for row in rows):
-        return linear.structural(lambda *v: jnp.stack(v), rows)[0]
-    return jnp.stack(rows)
-
-
-def _loop(turn: Callable[..., Any], carry: list[Any], xs: Sequence[Any], length: int, reverse: bool) -> list[Any]:
-    """A long scan as a scan over nodes: all its turns must have the same tiers, the fullest that any of them needs."""
-    box, jac = parts([*carry, *xs])
-
-    def promote(value: Any, like: Any) -> Any:
-        """`value` with every tier that `like` has."""
-        if not is_node(like):
-            return value
-        node = value if is_node(value) else as_node(value, jnp.shape(value), like.dtype)
-        form = node.form
-        if like.form is not None and form is None:
-            form = Form(slope_of(node, box), node.range, box)
-        return Node(node.range, form, jac_of(node, jac.lower.shape[0]) if like.jac is not None else node.jac)
-
-    def outward(x: Any) -> Any:
-        """Entries of the scanned axis first, also in slopes and Jacobians."""
-        if not is_node(x):
-            return x
-        x = normalised(x)
-        form = _form(x)
-        form = None if form is None else (jnp.swapaxes(form.slope, 0, 1), form.folded())
-        return x.range, form, jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), x.jac)
-
-    def inward(x: Any) -> Any:
-        if not isinstance(x, tuple):
-            return x
-        return Node(x[0], None if x[1] is None else Form(x[1][0], x[1][1], box), x[2])
-
-    def stacked(x: Any) -> Any:
-        return Node(x[0], *_unstack(x[1], x[2], box)) if isinstance(x, tuple) else x
-
-    def step(carry: list[Any], rows: list[Any]) -> tuple[list[Any], list[Any]]:
-        new, out = turn([inward(c) for c in carry], [inward(row) for row in rows])
-        new = [promote(value, inward(like)) for value, like in zip(new, carry, strict=True)]
-        return [_bare(value) for value in new], [_bare(value) for value in out]
-
-    rows = [outward(x) for x in xs]
-    first = jax.tree.map(lambda v: v[0], rows)
-    while True:
-        new = jax.eval_shape(lambda c, r: [_bare(v) for v in turn([inward(x) for x in c], [inward(x) for x in r])[0]],
-                             [_bare(c) for c in carry], first)  # fmt: skip
-        fuller = [promote(c, inward(like)) for c, like in zip(carry, new, strict=True)]
-        if jax.tree.structure(fuller) == jax.tree.structure(carry):
-            break
-        carry = fuller
-    last, ys = jax.lax.scan(step, [_bare(c) for c in carry], rows, length=length, reverse=reverse)
-    return [*(inward(c) for c in last), *(stacked(y) for y in ys)]
-
-
-def _bare(value: Any) -> Any:
-    """A node without the box, which is the same in every turn."""
-    if not is_node(value):
-        return value
-    value = normalised(value)
-    form = _form(value)
-    return value.range, None if form is None else (form.slope, form.folded()), value.jac
-
-
-def _form(node: Node) -> Form | None:
-    """The form of a node; none where only ranges were asked for."""
-    return None if POINT_MODE.get() else node.form
-
-
-def _unstack(form: Any, jac: Any, box: Any) -> tuple[Any, Any]:
-    swap = jax.tree.map(lambda v: jnp.swapaxes(v, 0, 1), jac)
-    return None if form is None else Form(jnp.swapaxes(form[0], 0, 1), form[1], box), swap
 
 
 CALLS: dict[str, Callable[..., Any]] = {"cond": _cond, "scan": _scan, "while": _while} | dict.fromkeys(
@@ -323,50 +236,3 @@ CALLS: dict[str, Callable[..., Any]] = {"cond": _cond, "scan": _scan, "while": _
     ),
     _call,
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _ByHand:
-    natural: Callable[..., Interval]
-    derivative: Callable[..., Any] | None
-
-
-_BY_HAND: dict[str, _ByHand] = {}
-
-
-def register_bounds(name: str, natural: Callable[..., Interval], derivative: Callable[..., Any] | None = None) -> None:
-    """Supply bounds by hand for a primitive, or for a function of your own under ``jax.jit``.
-
-    Args:
-        name: name of the primitive, or of the jitted function (its ``__name__``).
-        natural: takes one `Interval` per argument and returns an `Interval` that contains every value.
-        derivative: for elementwise functions; takes the same and returns one `Interval` per argument (or just one if
-            there is one argument) that contains the derivatives by that argument. Without it the derivative is
-            unknown, ``(-inf, inf)``.
-
-    The affine domain takes slope 0. Registered names come before the built-in table.
-
-    Source: theory 9.
-    """
-    if not callable(natural) or not (derivative is None or callable(derivative)):
-        raise ValueError(f"register_bounds: `natural` and `derivative` for {name!r} must be functions of intervals")
-    _BY_HAND[name] = _ByHand(natural, derivative)
-
-
-def _apply_by_hand(bounds: _ByHand, args: Sequence[Any]) -> Node:
-    dtype = next(arg.dtype for arg in args if is_node(arg))
-    nodes = [arg if is_node(arg) else as_node(arg, jnp.shape(arg), dtype) for arg in args]
-    ranges = [node.range for node in nodes]
-    natural = bounds.natural(*ranges)
-    if all(node.jac is None for node in nodes):
-        return Node(natural)
-    if bounds.derivative is None:
-        size = next(node.jac.lower.shape[0] for node in nodes if node.jac is not None)
-        unknown = jnp.full((size, *natural.lower.shape), jnp.inf, natural.lower.dtype)
-        return Node(natural, None, Interval.unchecked(-unknown, unknown))
-    slopes = bounds.derivative(*ranges)
-    slopes = [slopes] if isinstance(slopes, Interval) else list(slopes)
-    jac = None
-    for slope, node in zip(slopes, nodes, strict=True):
-        jac = join(jac, chain(slope, node.jac))
-    return Node(natural, None, jac)
