@@ -59,6 +59,8 @@ def with_anchored_rows(
         first = np.where(np.isfinite(now), np.minimum(now, rows_until_finite(scaled, lost)), now)
         for after in range(int(np.max(now, where=first < now, initial=0))):
             states = np.flatnonzero((first <= after) & (after < now))
+            if not states.size:
+                continue
             rows = _rows(affine, maps, width, lost, after, states)
             if rows is not None:
                 rows = stored_recovery(rows, observer, system, maps, nearest_feedthrough(T2, system.H), np.float64)
@@ -71,8 +73,8 @@ def with_anchored_rows(
             break  # nor after more rows
     if not added:
         return observer, certificate
-    if steps[-1] != tuple(unknown):
-        steps.append(tuple(map(float, unknown)))
+    if steps[-1] != said[-1]:  # gaps too long for these rows
+        steps.append(said[-1])
     recoverable = bool(np.isfinite(steps[0]).all())
     return (
         replace(observer, recovery=(*observer.recovery, *added)),

@@ -108,7 +108,7 @@ class Equations:
     def determined(self) -> tuple[np.ndarray, np.ndarray]:
         """A row m (columns, rows) for every entry of X, and which of them give it."""
         scaled = self.matrix / self.rows[:, None] * self.columns
-        inverse = np.linalg.pinv(scaled, rcond=1e-11)
+        inverse = np.where(scaled.any(1), np.linalg.pinv(scaled, rcond=1e-11), 0.0)  # what says nothing counts nothing
         given = np.abs(np.eye(scaled.shape[1]) - inverse @ scaled).max(1, initial=0.0) < _DETERMINED
         return inverse * self.columns[:, None] / self.rows, given
 
