@@ -26,12 +26,14 @@ def test_boxes_are_finite_again_as_soon_as_the_state_is_determined(name):
     x, y = records(name, 1)
     faulty, gaps = y.copy(), np.tile(y, (3, 1, 1))
     faulty[:, FAULT, 0] += 100
+    elsewhere, jumped = records(name, 2)
+    jumped[:, :FAULT] = y[:, :FAULT]
     for lost in (1, 2, 3):
         gaps[lost - 1, FAULT : FAULT + lost] = np.nan
     initial = Interval.symmetric(np.full(n, 2.0))
-    boxes = initial, initial, Interval.entire(n), *[initial] * 3
+    boxes = initial, initial, Interval.entire(n), *[initial] * 4
     starts = Interval(*(np.stack([getattr(box, side) for box in boxes]) for side in ("lower", "upper")))
-    est = jax.vmap(lambda box, y: gx.estimate(observer, box, y))(starts, np.concatenate([y, faulty, y, gaps]))
+    est = jax.vmap(lambda box, y: gx.estimate(observer, box, y))(starts, np.concatenate([y, faulty, y, gaps, jumped]))
     undisturbed, width = np.asarray(est.state.width)[0], np.asarray(est.state.width)
     N = steps_until_determined(name)
     assert N is not None
@@ -49,9 +51,14 @@ def test_boxes_are_finite_again_as_soon_as_the_state_is_determined(name):
     if shown.size:  # else the input explains the fault
         assert FAULT in (shown[0], shown[0] - 1)
         assert ok[1, shown[-1] + 1 + N :].all()
-        assert held[1, shown[-1] + 1 :].all()  # no row leans on what lies before
+        assert held[1, shown[-1] + 1 :].all()
+    shown = np.flatnonzero(status[6] & gx.Status.CONFLICT)
+    if shown.size:  # no row leans on what lies before
+        assert FAULT in (shown[0], shown[0] - 1)
+        assert shown[-1] <= shown[0] + 1
+        assert np.asarray(est.state.contains(elsewhere[0])).all(-1)[6, shown[-1] :].all()
     assert ok[1, -1].all()
-    assert held[2:].all()
+    assert held[2:6].all()
     assert (width[1:, -1] <= 1.05 * undisturbed[-1] + 1e-12).all()
     if N:  # what the certificate says of the first finite box
         first = width[2][steps.astype(int), np.arange(n)]
