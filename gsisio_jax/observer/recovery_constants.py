@@ -14,7 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.interval.box import Interval, magnitude
+from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.enclosures import affine_on_state_bounds
 from gsisio_jax.observer.recovery import Recovery
 
@@ -181,7 +181,7 @@ def with_constants(
     constant = weights @ offset
     terms = len(offset) + 16
     error = np.abs(weights) @ (around + terms * float(np.finfo(dtype).eps) * np.abs(offset)) * _UP
-    bounded = magnitude(system.input_bounds)[~free]
+    bounded = np.maximum(np.abs(system.input_bounds.lower), np.abs(system.input_bounds.upper))[~free]
     fixed = np.abs(np.vstack([system.G, system.H]))[:, ~free] @ bounded if len(bounded) else np.zeros(n + l)
     fixed = np.concatenate([*[fixed] * N, np.abs(T2) @ fixed[n:], np.zeros(len(used_box))])
     floor = ((np.abs(offset) + around + fixed) / equations.rows).max(initial=0.0)
