@@ -1,5 +1,5 @@
-"""`python -m benchmarks.recovery`: what the design of linear plants takes with recovery included, and after how many rows
-boxes are finite again.
+"""`python -m benchmarks.recovery`: what the design of linear plants takes with recovery included, and after how many
+rows boxes are finite again.
 
 Seconds are of CPU, in this process, the first plant apart (it warms up); programs are linear ones, solved for rows of
 windows and of recovery, and those that XLA compiled.

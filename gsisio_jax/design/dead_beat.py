@@ -38,7 +38,7 @@ def dead_beat_rows(
         The rows, those of one length together, without what rounding leaves of them (see `recovery_constants`); none
         where all of y[k] alone determines all states.
     """
-    n, l, q = problem.n, problem.l, problem.q
+    n, l = problem.n, problem.l
     if n > _LARGEST or (lost is None and np.linalg.matrix_rank(maps.slope[n + l :]) == n):
         return ()
     before, now = (np.isin(np.arange(l), list(outputs)) for outputs in lost or ((), ()))

@@ -88,7 +88,7 @@ class WindowProgram:
 
     def best(self, state: int, size: np.ndarray, drift: np.ndarray) -> tuple[np.ndarray, float] | None:
         """The parts of the row with the least ``size |parts| + drift parts``, and that; None where there is none."""
-        k, count = self.parts.shape
+        count = self.parts.shape[1]
         found = linprog(
             np.concatenate([np.zeros(count), size + drift, size - drift]),
             A_eq=self._constraints,

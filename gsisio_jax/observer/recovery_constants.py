@@ -56,8 +56,8 @@ class AffineMaps:
 class Equations:
     """``M X = r`` over N steps, the oldest first.
 
-    Rows: n of the plant and l of the outputs for each of the N steps, then q of T2 y at the last, then n of a box of the
-    first state where there is one. Columns: n states for each of N + 1 steps, then the free inputs of N steps.
+    Rows: n of the plant and l of the outputs for each of the N steps, then q of T2 y at the last, and n of the box of
+    the first state where there is one. Columns: n states for each of N + 1 steps, then the free inputs of N steps.
 
     Attributes:
         matrix, radius: M, and what its slopes are off by.
