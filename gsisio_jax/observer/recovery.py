@@ -104,7 +104,7 @@ def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noi
             believed = believed | ~(rows.scales[lag, system.n :] != 0).any()
         holds = holds & step.trusted & believed
     if rows.anchor is not None:
-        box = steps[-1].state
+        box: Any = steps[-1].state
         part = plain_image(rows.anchor, widened_for_sums(box, terms))
         total = Interval.unchecked(total.lower + part.lower, total.upper + part.upper)
         size = jnp.maximum(size, scale(rows.anchor_scales, magnitude(box)).max(initial=0.0))
