@@ -64,8 +64,8 @@ def with_anchored_rows(
             rows = _rows(affine, maps, width, lost, after, states)
             if rows is not None:
                 rows = stored_recovery(rows, observer, system, maps, nearest_feedthrough(T2, system.H), np.float64)
-            if rows is None:  # rounding leaves too much
-                first[states] = now[states]
+            if rows is None:  # what cancels has no bound; it may have one a row later
+                first[states] = after + 1
             else:
                 added.append(rows)
         steps.append(tuple(map(float, first)))
