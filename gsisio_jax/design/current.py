@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gsisio_jax.design.anchored import with_anchored_rows
 from gsisio_jax.design.assemble import Plan, assemble
 from gsisio_jax.design.dead_beat import dead_beat_rows
 from gsisio_jax.design.delay import with_delay
@@ -164,6 +165,8 @@ def design_current(
         return observer
     say("trying what happens after a lost row")
     certificate = with_recovery(observer, width, u_region)
+    if maps is not None:
+        observer, certificate = with_anchored_rows(observer, certificate, problem, maps, width)
     if certificate.recoverable is False:
         certificate = certificate.with_notes(what_recovers(plan, on, box))
     return replace(observer, certificate=certificate)

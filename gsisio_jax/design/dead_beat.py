@@ -16,7 +16,7 @@ from gsisio_jax.observer.recovery import Recovery
 from gsisio_jax.observer.recovery_constants import AffineMaps
 
 _LARGEST = 60  # states beyond which these programs take minutes
-_NOTHING = 1e-9  # singular values below this share count as 0
+NOTHING = 1e-9  # singular values below this share count as 0
 
 
 def dead_beat_rows(
@@ -38,28 +38,19 @@ def dead_beat_rows(
         The rows, those of one length together, without what rounding leaves of them (see `recovery_constants`); none
         where all of y[k] alone determines all states.
     """
-    n, l, q = problem.n, problem.l, problem.q
+    n, l = problem.n, problem.l
     if n > _LARGEST or (lost is None and np.linalg.matrix_rank(maps.slope[n + l :]) == n):
         return ()
-    F, E, Z = np.split(maps.slope, [n, n + l])
     before, now = (np.isin(np.arange(l), list(outputs)) for outputs in lost or ((), ()))
-    # An output without slopes and inputs is none.
-    E, H = np.where(before[:, None], 0, E), np.where(before[:, None], 0, problem.H)
-    Z = np.where((problem.T2[:, now] != 0).any(1)[:, None], 0, Z)
-    affine = replace(problem, F=F, E=E, H=H, C=np.vstack([Z, problem.C[q:]]))
-    scaled = affine.scaled(width)
-    # Widths of what is known of an equation, over its units.
-    y = np.where(problem.dv > 0, problem.dv, 1.0)
-    of_f, of_g, of_z = np.split(maps.radius / np.concatenate([width, y, np.abs(problem.T2) @ y]), [n, n + l])
-    of_f, of_g = of_f + scaled.dw / 2, of_g + scaled.dv / 2
+    affine = affine_problem(problem, maps, before, now)
+    scaled, y = affine.scaled(width), output_units(problem)
     determined = steps_until_determined(scaled)
     found, waiting = [], [i for i in range(n) if np.isfinite(determined[i])]
     for steps in range(n + 1 if lost is None else 2):
         if not waiting:
             break
         program = _without_boxes(scaled, steps)
-        size = np.concatenate([*[of_f] * steps, *[of_g] * steps, scaled.dv / 2, of_z, *[scaled.dd / 2] * steps])
-        size = np.where(size > 0, size, 1e-6)
+        size = sizes_without_boxes(affine, maps, width, steps)
         rows, radius = Rows([], []), {}
         for state in [i for i in waiting if determined[i] <= steps]:
             row = program.best(state, size, np.zeros_like(size))
@@ -71,7 +62,7 @@ def dead_beat_rows(
             waiting = [i for i in waiting if i not in radius]
             scales = np.tile(1 / np.concatenate([width, y]), (steps + 1, 1))
             scales[:steps, n:][:, before], scales[-1, n:][now] = 0, 0
-            found.append(_as_recovery(affine, steps, rows, radius, width, scales))
+            found.append(as_recovery(affine, steps, rows, radius, width, scales))
     return tuple(found)
 
 
@@ -82,33 +73,64 @@ def steps_until_determined(problem: GainProblem) -> np.ndarray:
     The states that no measurement of the window tells from 0 are a subspace, and that of one more step follows from it;
     where it stays what it is, it stays so for good.
     """
-    n, Z, G, H = problem.n, problem.C[: problem.q], problem.G[:, problem.free], problem.H[:, problem.free]
-    unseen, before, steps = _kernel(Z), np.eye(n), np.full(n, np.inf)
+    n = problem.n
+    unseen, before, steps = _kernel(problem.C[: problem.q]), np.eye(n), np.full(n, np.inf)
     for N in range(n + 1):
-        steps = np.where(np.isinf(steps) & (np.abs(unseen).max(1, initial=0.0) < _NOTHING), N, steps)
-        # (a, d) that y[k-1] does not show and that lead to a state that y[k] does not show, whatever d[k] is.
-        ahead = np.hstack([problem.F @ before, G])
-        quiet = _kernel(np.vstack([np.hstack([problem.E @ before, H]), Z @ ahead]))
-        after = _basis(ahead @ quiet)
+        steps = np.where(np.isinf(steps) & (np.abs(unseen).max(1, initial=0.0) < NOTHING), N, steps)
+        after = unseen_after(problem, before, True, True)
         if after.shape[1] == unseen.shape[1]:
             break
         unseen = before = after
     return steps
 
 
+def unseen_after(problem: GainProblem, before: np.ndarray, measured: bool, measured_now: bool) -> np.ndarray:
+    """A basis of the states that follow in one step from those that a basis spans, whatever the free inputs are, if
+    y[k-1] does not show what it begins with, where it was measured, nor y[k] what it leads to, whatever d[k] is."""
+    Z, G, H = problem.C[: problem.q], problem.G[:, problem.free], problem.H[:, problem.free]
+    ahead = np.hstack([problem.F @ before, G])
+    shown = [np.hstack([problem.E @ before, H])] * measured + [Z @ ahead] * measured_now
+    return _basis(ahead @ _kernel(np.vstack([np.zeros((0, ahead.shape[1])), *shown])))
+
+
+def affine_problem(problem: GainProblem, maps: AffineMaps, before: np.ndarray, now: np.ndarray) -> GainProblem:
+    """The problem with the slopes of affine bounds, without the outputs of y[k-1] and of y[k] in these masks (l,)."""
+    F, E, Z = np.split(maps.slope, [problem.n, problem.n + problem.l])
+    # An output without slopes and inputs is none.
+    E, H = np.where(before[:, None], 0, E), np.where(before[:, None], 0, problem.H)
+    Z = np.where((problem.T2[:, now] != 0).any(1)[:, None], 0, Z)
+    return replace(problem, F=F, E=E, H=H, C=np.vstack([Z, problem.C[problem.q :]]))
+
+
+def sizes_without_boxes(problem: GainProblem, maps: AffineMaps, width: np.ndarray, steps: int) -> np.ndarray:
+    """Half widths of what is known of the equations of a window, over their units; for a `WindowProgram` in units of
+    these widths, without slopes on boxes."""
+    scaled, y = problem.scaled(width), output_units(problem)
+    units = np.concatenate([width, y, np.abs(problem.T2) @ y])
+    of_f, of_g, of_z = np.split(maps.radius / units, [problem.n, problem.n + problem.l])
+    of_f, of_g = of_f + scaled.dw / 2, of_g + scaled.dv / 2
+    size = np.concatenate([*[of_f] * steps, *[of_g] * steps, scaled.dv / 2, of_z, *[scaled.dd / 2] * steps])
+    return np.where(size > 0, size, 1e-6)
+
+
+def output_units(problem: GainProblem) -> np.ndarray:
+    """Units of the outputs, (l,)."""
+    return np.where(problem.dv > 0, problem.dv, 1.0)
+
+
 def _kernel(matrix: np.ndarray) -> np.ndarray:
     """An orthonormal basis of what a matrix makes 0, in columns."""
     _, values, rows = np.linalg.svd(matrix)
-    return rows[int((values > _NOTHING * values.max(initial=1.0)).sum()) :].T
+    return rows[int((values > NOTHING * values.max(initial=1.0)).sum()) :].T
 
 
 def _basis(columns: np.ndarray) -> np.ndarray:
     """An orthonormal basis of what columns span."""
     left, values, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, values > _NOTHING * values.max(initial=1.0)]
+    return left[:, values > NOTHING * values.max(initial=1.0)]
 
 
-def _as_recovery(
+def as_recovery(
     problem: GainProblem, steps: int, rows: Rows, radius: dict[int, float], width: np.ndarray, scales: np.ndarray
 ) -> Recovery:
     """Rows of one length in the units of the plant."""

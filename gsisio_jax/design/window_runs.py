@@ -25,10 +25,8 @@ class Rows:
 
     def add(self, state: int, parts: np.ndarray) -> None:
         """Unless it is there."""
-        same = (
-            np.allclose(parts, old, atol=1e-7) for old, of in zip(self.parts, self.states, strict=True) if of == state
-        )
-        if not any(same):
+        own = np.array([old for old, of in zip(self.parts, self.states, strict=True) if of == state])
+        if not np.isclose(parts, own.reshape(-1, len(parts)), atol=1e-7).all(1).any():
             self.parts.append(parts)
             self.states.append(state)
 

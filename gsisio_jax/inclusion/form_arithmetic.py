@@ -16,6 +16,7 @@ from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, nan_to_unbounded
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import add_up, times
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 
 def is_known(value: Any) -> bool:
@@ -33,11 +34,11 @@ def known_if_concrete(value: Any, dtype: Any = None) -> Any:
 
 
 def fold(call: Any, *values: Any) -> Any:
-    """Call a JAX function, while tracing where all arguments are known."""
+    """Call a JAX function, while tracing where all arguments are known: in NumPy, as JAX compiles it operation by
+    operation for every new shape."""
     if not all(is_known(value) for value in values):
         return call(*values)
-    with jax.ensure_compile_time_eval():
-        return jax.tree.map(np.asarray, call(*values))
+    return numpy_function(call, *values)(*values)
 
 
 def is_point(a: Interval) -> bool:

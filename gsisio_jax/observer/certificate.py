@@ -40,7 +40,8 @@ class Certificate(eqx.Module):
         recovery_width: (n,) bound of the width of the box then, at the noise of the design (where it was tried: the
             width at the end of the trial).
         lost_row_steps: the same after 1, 2, ... lost rows between boxes that were finite; more rows than listed take
-            what the last entry says. Tried; where f and g are affine the trial is the rule.
+            what the last entry says. Tried, or proved by rows that lean on the box before the gap; where f and g are
+            affine the trial is the rule.
         window: what rows over several steps make of widths (`WindowWidths`), where f and g are affine; else None.
         slices: the slopes on parts of the region (`Slices`), where the design was asked to `split` it; else None. Then
             `next_width` and `steady_width` count them, and widths may settle where `rate` is above 1.

@@ -22,8 +22,8 @@ class Past(eqx.Module):
         y, u, noise: of that step.
         believed: its measurement was.
         trusted: no conflict since has thrown away what was known then.
-        state: box of x, (n,); None, like the next two, for steps that windows do not reach.
-        h: bounds of f and g on it.
+        state: box of x, (n,); None for steps on whose box no row leans.
+        h: bounds of f and g on it; None, like the next one, for steps that windows do not reach.
         input: upper bound (p,) of |d| then.
     """
 
@@ -36,9 +36,9 @@ class Past(eqx.Module):
     h: AtomBounds | None = None
     input: Any = None
 
-    def without_boxes(self) -> Past:
-        """What was measured then, alone."""
-        return replace(self, state=None, h=None, input=None)
+    def measured(self, state: bool) -> Past:
+        """What was measured then alone, or with the box of the state."""
+        return replace(self, state=self.state if state else None, h=None, input=None)
 
 
 def before_all(carry: Any, observer: Any) -> tuple[Past, ...]:
@@ -81,7 +81,8 @@ def _depth(observer: Any) -> int:
 
 def _as_needed(pasts: tuple[Past, ...], observer: Any) -> tuple[Past, ...]:
     whole = max((rows.length - 1 for rows in (observer.window, observer.input_rows) if rows is not None), default=0)
-    return (*pasts[:whole], *(past.without_boxes() for past in pasts[whole:]))
+    boxes = max((rows.length - 1 for rows in observer.recovery or () if rows.anchor is not None), default=0)
+    return (*pasts[:whole], *(past.measured(lag < boxes) for lag, past in enumerate(pasts[whole:], whole)))
 
 
 def _kept(h: AtomBounds) -> AtomBounds:

@@ -27,9 +27,10 @@ from gsisio_jax.plant.system import Noise
 
 class Recovery(eqx.Module):
     """R rows for single states from measurements, known inputs and noise of N steps and of now; lag t is step k-1-t.
+    Those with an anchor also lean on the box of the oldest step, and bridge measurements that were lost since.
 
         x_i in sum over t of {multipliers [B u + w; D u + v - y]}[k-1-t] + output (y - D u - v)[k] + constant
-               + sum over t of known (bounded inputs)[k-1-t]  +-  slack size
+               + sum over t of known (bounded inputs)[k-1-t] + anchor x[k-N]  +-  slack size
 
     where `size` is the largest number that enters, in units of its own.
 
@@ -44,6 +45,8 @@ class Recovery(eqx.Module):
         floor: (), least size: constants and bounded inputs.
         width: (R,), of boxes from these rows alone, at the noise of the design.
         targets: the state i of every row.
+        anchor: (R, n); None for rows that need no box.
+        anchor_scales: (n,), as `scales` for the states of that box.
     """
 
     multipliers: Any
@@ -56,6 +59,8 @@ class Recovery(eqx.Module):
     floor: Any
     width: Any
     targets: tuple[int, ...] = eqx.field(static=True)
+    anchor: Any = None
+    anchor_scales: Any = None
 
     @property
     def length(self) -> int:
@@ -65,15 +70,16 @@ class Recovery(eqx.Module):
 
 @jax.named_scope("recovery")
 def contract(observer: Any, domain: Domain, carry: Any, y: Any, u: Any, noise: Noise) -> Domain:
-    """Contract the box of x[k] with all rows; they hold as long as all measurements of their steps are believed."""
+    """Contract the box of x[k] with all rows; they hold as long as all measurements that they use are believed."""
     for rows in observer.recovery:
         domain = domain.intersect(_boxes(observer, rows, carry, y, u, noise), Source.STATE)
     return domain
 
 
 def covers_all(observer: Any) -> bool:
-    """Is there a row for every state?"""
-    return len({i for rows in observer.recovery or () for i in rows.targets}) == observer.system.n
+    """Is there a row for every state that needs no box?"""
+    alone = [rows for rows in observer.recovery or () if rows.anchor is None]
+    return len({i for rows in alone for i in rows.targets}) == observer.system.n
 
 
 def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noise) -> Interval:
@@ -81,6 +87,7 @@ def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noi
     system = observer.system
     steps = (past.last(carry, None), *carry.older)[: rows.length]
     terms = rows.length * rows.multipliers.shape[-1] + system.l + rows.known.shape[-1] * rows.length + 4
+    terms += 0 if rows.anchor is None else system.n + 1
     now = output_box(system, y, u, noise.v)
     total = plain_image(rows.output, widened_for_sums(now, terms))
     total = Interval.unchecked(total.lower + rows.constant.lower, total.upper + rows.constant.upper)
@@ -92,9 +99,17 @@ def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noi
         part = plain_image(weights, seen)
         total = Interval.unchecked(total.lower + part.lower, total.upper + part.upper)
         size = jnp.maximum(size, scale(rows.scales[lag], magnitude(seen)[: system.n + system.l]).max(initial=0.0))
-        holds = holds & step.trusted & step.believed
+        believed = step.believed
+        if rows.anchor is not None:  # in a gap nothing is used that could be wrong
+            believed = believed | ~(rows.scales[lag, system.n :] != 0).any()
+        holds = holds & step.trusted & believed
+    if rows.anchor is not None:
+        box: Any = steps[-1].state
+        part = plain_image(rows.anchor, widened_for_sums(box, terms))
+        total = Interval.unchecked(total.lower + part.lower, total.upper + part.upper)
+        size = jnp.maximum(size, scale(rows.anchor_scales, magnitude(box)).max(initial=0.0))
     if rounding.outward():
         total = plainly_wider(total, rounding.generous(scale(rows.slack, size)))
-    # A missing measurement that counts makes the size infinite, and then nothing is known.
+    # A missing measurement or an infinite box that counts makes the size infinite, and then nothing is known.
     holds = holds & (size < jnp.inf)
     return by_state(everything_unless(holds, total), rows.targets, system.n)

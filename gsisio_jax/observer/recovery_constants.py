@@ -14,7 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.interval.box import Interval, magnitude
+from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.enclosures import affine_of
 from gsisio_jax.observer.recovery import Recovery
 
@@ -56,8 +56,8 @@ class AffineMaps:
 class Equations:
     """``M X = r`` over N steps, the oldest first.
 
-    Rows: n of the plant and l of the outputs for each of the N steps, then q of T2 y at the last. Columns: n states for
-    each of N + 1 steps, then the free inputs of N steps.
+    Rows: n of the plant and l of the outputs for each of the N steps, then q of T2 y at the last, and n of the box of
+    the first state where there is one. Columns: n states for each of N + 1 steps, then the free inputs of N steps.
 
     Attributes:
         matrix, radius: M, and what its slopes are off by.
@@ -99,10 +99,16 @@ class Equations:
             self, matrix=np.where(lost[:, None], 0, self.matrix), radius=np.where(lost[:, None], 0, self.radius)
         )
 
+    def anchored(self, n: int) -> Equations:
+        """With the first n states known."""
+        matrix = np.vstack([self.matrix, np.eye(n, self.matrix.shape[1])])
+        radius = np.vstack([self.radius, np.zeros((n, self.matrix.shape[1]))])
+        return replace(self, matrix=matrix, radius=radius, rows=np.concatenate([self.rows, self.columns[:n]]))
+
     def determined(self) -> tuple[np.ndarray, np.ndarray]:
         """A row m (columns, rows) for every entry of X, and which of them give it."""
         scaled = self.matrix / self.rows[:, None] * self.columns
-        inverse = np.linalg.pinv(scaled, rcond=1e-11)
+        inverse = np.where(scaled.any(1), np.linalg.pinv(scaled, rcond=1e-11), 0.0)  # what says nothing counts nothing
         given = np.abs(np.eye(scaled.shape[1]) - inverse @ scaled).max(1, initial=0.0) < _DETERMINED
         return inverse * self.columns[:, None] / self.rows, given
 
@@ -141,14 +147,18 @@ def with_constants(
     unused = found.scales == 0  # not to be relied on: a measurement that may be missing
     lost = np.concatenate([unused[:N][::-1].ravel(), (T2[:, unused[N, n:]] != 0).any(1)])
     equations = equations.without(lost)
+    if found.anchor is not None:
+        equations = equations.anchored(n)
     off = np.zeros_like(equations.matrix)  # what M is off by because H is
     for j in range(N):
         d_j = (N + 1) * n + j * slack.shape[1]
         off[j * (n + l) + n : (j + 1) * (n + l), d_j : d_j + slack.shape[1]] = slack
-    off[lost] = 0
+    off[: len(lost)][lost] = 0
     # Rows in the order of the equations: what multiplies g has the other sign.
     weights = found.multipliers[::-1] * np.concatenate([np.ones(n), -np.ones(l)])
     weights = np.concatenate([weights.transpose(1, 0, 2).reshape(R, -1), found.remainder], 1)
+    if found.anchor is not None:
+        weights = np.concatenate([weights, found.anchor], 1)
     left = equations.missed(weights, N * n + np.array(found.targets), off)
     every, given = equations.determined()
     rho = equations.missed(every, np.arange(len(given)), off)
@@ -160,18 +170,20 @@ def with_constants(
     entry = 4 * (np.abs(every[needed]) @ equations.rows / equations.columns[needed]).max(initial=0.0) * _UP
 
     used = (np.concatenate([every[needed], weights]) != 0).any(0)
-    now = np.concatenate([np.zeros(n, bool), (T2[used[N * (n + l) :]] != 0).any(0)])
-    by_entry = np.vstack([used[: N * (n + l)].reshape(N, n + l)[::-1], now])
+    used, used_now, used_box = np.split(used, [N * (n + l), N * (n + l) + len(T2)])
+    now = np.concatenate([np.zeros(n, bool), (T2[used_now] != 0).any(0)])
+    by_entry = np.vstack([used.reshape(N, n + l)[::-1], now])
     sign = np.concatenate([np.ones(n), -np.ones(l + len(T2))])
     offset, around = (
-        np.concatenate([*[part[: n + l]] * N, part[n + l :]]) for part in (maps.center * sign, maps.radius)
+        np.concatenate([*[part[: n + l]] * N, part[n + l :], np.zeros(len(used_box))])
+        for part in (maps.center * sign, maps.radius)
     )
     constant = weights @ offset
     terms = len(offset) + 16
     error = np.abs(weights) @ (around + terms * float(np.finfo(dtype).eps) * np.abs(offset)) * _UP
-    bounded = magnitude(system.input_bounds)[~free]
+    bounded = np.maximum(np.abs(system.input_bounds.lower), np.abs(system.input_bounds.upper))[~free]
     fixed = np.abs(np.vstack([system.G, system.H]))[:, ~free] @ bounded if len(bounded) else np.zeros(n + l)
-    fixed = np.concatenate([*[fixed] * N, np.abs(T2) @ fixed[n:]])
+    fixed = np.concatenate([*[fixed] * N, np.abs(T2) @ fixed[n:], np.zeros(len(used_box))])
     floor = ((np.abs(offset) + around + fixed) / equations.rows).max(initial=0.0)
     return replace(
         found,
@@ -179,6 +191,7 @@ def with_constants(
         slack=left @ equations.columns * entry * _UP,
         scales=np.where(by_entry, 1 / units, 0.0) * (1 + 1e-6),
         floor=np.asarray(floor * (1 + 1e-6)),
+        anchor_scales=None if found.anchor is None else np.where(used_box, 1 / units[:n], 0.0) * (1 + 1e-6),
     )
 
 

@@ -161,7 +161,7 @@ def with_rounding_constants(
     input_rows = wide.input_rows
     if input_rows is not None:
         input_rows = with_input_residual(input_rows, system, H_slack, dtype)
-    recovery = [_recovery(rows, wide, system, affine, H_slack, dtype) for rows in wide.recovery or () if affine]
+    recovery = [stored_recovery(rows, wide, system, affine, H_slack, dtype) for rows in wide.recovery or () if affine]
     first = InitialContraction(
         form=None if system.g_takes_u else jax.tree.map(lambda x: np.asarray(x, dtype), form),
         slack=_cast(slack, dtype),
@@ -225,7 +225,7 @@ def with_input_residual(rows: Any, system: Any, H_slack: np.ndarray, dtype: Any)
     return replace(rows, left=_cast(input_row_residual(rows, system, H_slack), dtype))
 
 
-def _recovery(rows: Any, wide: Any, system: Any, affine: AffineMaps, H_slack: np.ndarray, dtype: Any) -> Any:
+def stored_recovery(rows: Any, wide: Any, system: Any, affine: AffineMaps, H_slack: np.ndarray, dtype: Any) -> Any:
     """Rows of recovery, as `_cast_window`; None where they do not hold in that type."""
     rows = replace(rows, output=_rounded_once(rows.remainder, wide.T2))
     rows = jax.tree.map(lambda x: np.asarray(x, dtype).astype(np.float64), rows)
@@ -234,7 +234,8 @@ def _recovery(rows: Any, wide: Any, system: Any, affine: AffineMaps, H_slack: np
     if found is None:
         return None
     sides = known(found.constant, dtype)
-    upward = {name: _cast(getattr(found, name), dtype) for name in ("slack", "scales", "floor", "width")}
+    names = "slack", "scales", "floor", "width", "anchor_scales"
+    upward = {name: _cast(getattr(found, name), dtype) for name in names}
     return replace(jax.tree.map(lambda x: np.asarray(x, dtype), found), constant=sides, **upward)
 
 

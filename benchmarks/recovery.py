@@ -1,0 +1,78 @@
+"""`python -m benchmarks.recovery`: what the design of linear plants takes with recovery included, and after how many
+rows boxes are finite again.
+
+Seconds are of CPU, in this process, the first plant apart (it warms up); programs are linear ones, solved for rows of
+windows and of recovery, and those that XLA compiled.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+import gsisio_jax as gx
+from benchmarks import tightness
+from benchmarks.plants import from_tests
+from gsisio_jax.design import window_program
+
+
+class Counted:
+    """Counts linear programs and compilations while it is open."""
+
+    def __enter__(self) -> Counted:
+        self.programs, self.compiled, self.solve = 0, 0, window_program.linprog
+        window_program.linprog = self._solved
+        jax.monitoring.register_event_duration_secs_listener(self._listen)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        window_program.linprog = self.solve
+        jax.monitoring.unregister_event_duration_listener(self._listen)
+
+    def _solved(self, *args: Any, **kwargs: Any) -> Any:
+        self.programs += 1
+        return self.solve(*args, **kwargs)
+
+    def _listen(self, event: str, *_: Any, **__: Any) -> None:
+        self.compiled += event.endswith("backend_compile_duration")
+
+
+def plants() -> dict[str, tuple[np.ndarray, ...]]:
+    """A, C, G, H and the magnitudes of w and v."""
+    found = {}
+    for make in (tightness.rotation, tightness.chain, tightness.network, tightness.full_rank):
+        plant = make()
+        found[make.__name__] = plant.A, plant.C, plant.G, plant.H, plant.w, plant.v
+    ours = from_tests("recovery_plants").PLANTS
+    return found | {name: plant for name, plant in ours.items() if name == "one output" or name.startswith("random")}
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    every = plants()
+    _designed(every["rotation"])
+    print("| Plant | n, l, p | design s | linear programs | compiled | rows until finite: any state | 1, 2, 3 lost |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for name, plant in every.items():
+        with Counted() as count:
+            started = time.process_time()
+            certificate = _designed(plant).certificate
+            seconds = time.process_time() - started
+        n, l, p = len(plant[0]), len(plant[1]), plant[2].shape[1]
+        rows = [f"{certificate.rows_until_finite(lost).max():.0f}" for lost in (None, 1, 2, 3)]
+        print(f"| {name} | {n}, {l}, {p} | {seconds:.1f} | {count.programs} | {count.compiled} | {rows[0]} | "
+              f"{', '.join(rows[1:])} |", flush=True)  # fmt: skip
+
+
+def _designed(plant: tuple[np.ndarray, ...]) -> gx.Observer:
+    A, C, G, H, w, v = plant
+    system = gx.System(lambda x: A @ x, lambda x: C @ x, G=G, H=H)
+    noise = gx.Noise(gx.Interval.symmetric(w), gx.Interval.symmetric(v))
+    return gx.design_observer(system, noise, gx.Interval.symmetric(np.full(len(A), 5.0)), certify=False)
+
+
+if __name__ == "__main__":
+    main()
