@@ -70,7 +70,7 @@ def what_helps(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Inte
         f"  {_words(kind, members)}: {'widths settle' if settles else 'finite boxes, but no width settles'}"
         for (kind, settles), members in sorted(found.items(), key=lambda item: not item[0][1])
     ]
-    return "\nTried one by one, each of these is enough:\n" + ";\n".join(lines) + "."
+    return "\nTried one by one (no two of them together), each of these is enough:\n" + ";\n".join(lines) + "."
 
 
 def what_settles(plan: Plan, slopes_on: Callable[[Interval], Slopes], region: Interval) -> str:
