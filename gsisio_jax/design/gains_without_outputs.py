@@ -90,7 +90,7 @@ def reduced(problem: GainProblem, j: int) -> tuple[GainProblem, np.ndarray]:
 
 
 def _without(problem: GainProblem, j: int, region: Interval) -> np.ndarray | None:
-    """The certified gain of the plant without output j, as a gain (n, columns) of the plant; None where there is none."""
+    """The certified gain of the plant without output j, as a gain of the plant; None where there is none."""
     l, q = problem.l, problem.q
     others = np.delete(np.arange(l), j)
     less, mixed = reduced(problem, j)

@@ -1,4 +1,4 @@
-"""How often a step applies the certified bound, and what that leaves of the region in the promise (theory 5.6 and 6)."""
+"""How often a step applies the certified bound, and what that leaves of the region in the promise (theory 5.6, 6)."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def with_rounds(certificate: Certificate, noise: Noise, state_bounds: Interval) 
     width = np.minimum(np.asarray(certificate.region.width), np.asarray(state_bounds.width))
     if not np.isfinite(width[implicit.any(0)]).all():
         return certificate.with_notes(
-            "the region is unbounded where outputs are nonlinear, so widths are promised up to the error with which the "
-            "outputs are solved for the state (theory 5.6)"
+            "the region is unbounded where outputs are nonlinear, so widths are promised up to the error with which "
+            "the outputs are solved for the state (theory 5.6)"
         )
     exact = certificate.steady_width if certificate.certified else certificate.inverse @ certificate.noise_width(noise)
     width = np.where(np.isfinite(width), width, 0.0)  # nothing is multiplied with it
