@@ -10,8 +10,8 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.plant.system import Noise
 
-_ONCE = 0.05  # of the width, that the promise may be larger where one round, which costs nothing, leaves that much
-_SHARE = 2.5e-3  # where there are more
+_CHEAP = 0.005  # share of the width that the promise may be larger where so few rounds leave that
+_SHARE = 0.0025  # where there are more
 _MOST = 64
 
 
@@ -38,7 +38,7 @@ def with_rounds(certificate: Certificate, noise: Noise, state_bounds: Interval) 
         found = replace(certificate, rounds=rounds, excess=np.linalg.matrix_power(implicit, rounds) @ width)
         reached = found.widths(noise) if certificate.certified else exact + found.excess
         fits = ~(exact <= certificate.region.width) | (reached <= certificate.region.width)
-        if (reached <= exact * (1 + (_ONCE if rounds == 1 else _SHARE))).all() and fits.all():
+        if (reached <= exact * (1 + (_CHEAP if rounds <= 2 else _SHARE))).all() and fits.all():
             break
     if not certificate.certified:
         return found
