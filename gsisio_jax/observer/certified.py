@@ -85,8 +85,8 @@ def _recentred(
 ) -> Interval:
     """Bound x, where ``x + N_z psi(x) in right`` and x lies in `within`, about the middle of what is left of that.
 
-    With ``mid +- rad = right`` and b the middle of a box of radius rho, ``|x - (mid - N_z psi(b))| <= rad + |N_z| R rho``:
-    whatever b misses of the solution, the new box is no wider than that.
+    With ``mid +- rad = right`` and b the middle of a box of radius rho, ``|x - (mid - N_z psi(b))|`` is at most
+    ``rad + |N_z| R rho``: whatever b misses of the solution, the new box is no wider than that.
 
     Args:
         right: box (n,).
