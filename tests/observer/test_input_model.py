@@ -144,7 +144,7 @@ def test_two_inputs_one_of_them_in_the_outputs():
     C, v = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([0.1, 0.1, 0.1])
     noise = gx.Noise(Interval.symmetric(W), Interval.symmetric(v))
     rng = np.random.default_rng(3)
-    d = [*np.cumsum(rng.uniform(-1, 1, (T - 1, 2)) * [0.02, 0.01], axis=0), 3.0, -2.0]
+    d = np.array([3.0, -2.0]) + np.cumsum(rng.uniform(-1, 1, (T - 1, 2)) * [0.02, 0.01], axis=0)
     widths = []
     for known in ({"input_rate": [0.02, 0.01]}, {}):
         system = gx.System(lambda x: A @ x, lambda x: C @ x, G2, H2, **known)
