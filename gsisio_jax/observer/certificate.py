@@ -42,8 +42,8 @@ class Certificate(eqx.Module):
         lost_row_steps: the same after 1, 2, ... lost rows between boxes that were finite; more rows than listed take
             what the last entry says. Tried; where f and g are affine the trial is the rule.
         window: what rows over several steps make of widths (`WindowWidths`), where f and g are affine; else None.
-        rounds: how often the certified bound is applied in a step, about the middle of what it has left (theory 5.6): they
-            leave `excess` of boxes as wide as the region. 0: the linear equation for x[k] is solved (prediction form).
+        rounds: how often the certified bound is applied in a step, about the middle of what it has left (theory 5.6).
+        excess: (n,), width that they leave of boxes as wide as the region.
         slices: the slopes on parts of the region (`Slices`), where the design was asked to `split` it; else None. Then
             `next_width` and `steady_width` count them, and widths may settle where `rate` is above 1.
         notes: what a reader should know besides.
@@ -76,7 +76,7 @@ class Certificate(eqx.Module):
     window: Any = None
     slices: Any = None
     input_noise_w: Any = None  # (p, n), weight of w in input boxes beside that of `input_state_now`; None: nothing
-    excess: Any = 0.0  # (n,), how much of the region `rounds` leave
+    excess: Any = 0.0
     rounds: int = eqx.field(static=True, default=0)
 
     @property

@@ -83,8 +83,8 @@ class Slices(eqx.Module):
         return np.einsum("ijk,...jak->...ija", density, lengths).max(-1)
 
     def settled(self, start: Any, inverse: np.ndarray, added: np.ndarray, excess: Any = 0.0) -> np.ndarray:
-        """Widths (..., n) at or below which boxes of the region settle: ``V (growth(width) + added) + excess`` again and
-        again.
+        """Widths (..., n) at or below which boxes of the region settle: ``V (growth(width) + added) + excess`` again
+        and again.
 
         `start`, at most the width of the region, bounds them to begin with. Widths that stay above it do not fit.
         """

@@ -51,7 +51,7 @@ def test_widths_keep_the_promise_from_any_box_of_the_region():
 
 
 def test_no_box_of_the_unicycle_is_wider_than_promised():
-    """Solving ranges and a bearing for the position leaves something of every box (theory 5.6): the promise counts it."""
+    """Solving ranges and a bearing for the position leaves something of a box (theory 5.6): the promise counts it."""
     example = gx.examples.load("unicycle")
     record = example.record()
     observer = gx.design_observer(
