@@ -87,6 +87,7 @@ class DesignPart(Part):
     sweeps: Annotated[int, Field(ge=1)] | None = None
     window: Count = None
     split: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
+    cells: Annotated[int, Field(ge=1)] | None = None
     delay: Annotated[int, Field(ge=0)] | Literal["auto"] | None = None
     bounds: Annotated[list[str], Field(min_length=1)] | None = None
     form: Literal["current", "prediction"] | None = None

@@ -43,8 +43,8 @@ in their own --help):
   [u_region]                         # box of known inputs; needed where f or g takes u
   [initial]                          # box of the first state
   [design]                           # options of gx.design_observer, which explains them
-  gains = 1                          # also sweeps, window, delay, split, missing, certify, bounds,
-                                     # form = "prediction", left_inverse, allow_uncertified
+  gains = 1                          # also sweeps, window, delay, split, cells, missing, certify,
+                                     # bounds, form = "prediction", left_inverse, allow_uncertified
   [estimate]
   on_conflict = "restart"            # or "hold": what is believed after a contradiction
   [outputs]                          # file names: netcdf, csv, picture, report; draw = "module:function"

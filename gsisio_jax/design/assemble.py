@@ -12,6 +12,7 @@ from gsisio_jax.design.feedthrough import Feedthrough
 from gsisio_jax.design.inputs import InputBounds
 from gsisio_jax.design.planes import plane_bounds
 from gsisio_jax.design.problem import GainProblem, beyond_rounding, left_of_states
+from gsisio_jax.design.rounds import with_rounds
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.bank import LinearBounds
@@ -81,6 +82,7 @@ def assemble(
     l, q = problem.l, problem.q
     # Where f and g are affine no enclosure depends on the region, so there is no region to leave.
     certificate = _certificate(plan, problem, Interval.entire(system.n) if affine else region, bank[0], inputs)
+    certificate = with_rounds(certificate, plan.noise, system.state_bounds)
 
     def planes(function: Callable[[Any, Any], Any]) -> Abstraction | None:
         return plane_bounds(system, function, region, plan.u_region) if "abstraction" in bounds else None

@@ -26,6 +26,7 @@ from gsisio_jax.design.gain_selection import (
 )
 from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.gains_with_less import gains_with_less
+from gsisio_jax.design.gains_without_outputs import gains_without_outputs
 from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
 from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.input_rows import rows_of_inputs
@@ -36,7 +37,7 @@ from gsisio_jax.design.region import find_region, grown_around
 from gsisio_jax.design.slices import with_slices
 from gsisio_jax.design.tolerant import Guessed, tolerant
 from gsisio_jax.design.undefined import undefined_in
-from gsisio_jax.design.window import window_rows
+from gsisio_jax.design.window_with_less import window_rows_with_less
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.cells import counts
@@ -124,6 +125,7 @@ def design_current(
         bank.extend(guessed.gains())
     bank = distinct([*bank, *gains_without_state_bounds(problem, main, box)])
     bank = distinct([*bank, *gains_with_less(problem, bank, box)])
+    bank = distinct([*bank, *gains_without_outputs(problem, bank, box)])
     observer = assembled(bank, width)
     if first.uncertified:
         observer = replace(observer, certificate=observer.certificate.without_promise(first.uncertified))
@@ -143,7 +145,7 @@ def design_current(
         window = 1
     if window != 1:
         say("choosing rows over several steps")
-        rows = window_rows(problem, window, width, bank)
+        rows = window_rows_with_less(problem, window, width, bank)
         observer = replace(observer, window=rows)
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)

@@ -72,7 +72,7 @@ def what_helps(plan: Plan, on: Enclosures, region: Interval | None) -> str:
         f"  {_words(kind, members)}: {'widths settle' if settles else 'finite boxes, but no width settles'}"
         for (kind, settles), members in sorted(found.items(), key=lambda item: not item[0][1])
     ]
-    return "\nTried one by one, each of these is enough:\n" + ";\n".join(lines) + "."
+    return "\nTried one by one (no two of them together), each of these is enough:\n" + ";\n".join(lines) + "."
 
 
 def what_settles(plan: Plan, on: Enclosures, region: Interval) -> str:

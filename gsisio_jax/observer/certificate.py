@@ -43,6 +43,8 @@ class Certificate(eqx.Module):
             what the last entry says. Tried, or proved by rows that lean on the box before the gap; where f and g are
             affine the trial is the rule.
         window: what rows over several steps make of widths (`WindowWidths`), where f and g are affine; else None.
+        rounds: how often the certified bound is applied in a step, about the middle of what it has left (theory 5.6).
+        excess: (n,), width that they leave of boxes as wide as the region.
         slices: the slopes on parts of the region (`Slices`), where the design was asked to `split` it; else None. Then
             `next_width` and `steady_width` count them, and widths may settle where `rate` is above 1.
         notes: what a reader should know besides.
@@ -75,6 +77,8 @@ class Certificate(eqx.Module):
     window: Any = None
     slices: Any = None
     input_noise_w: Any = None  # (p, n), weight of w in input boxes beside that of `input_state_now`; None: nothing
+    excess: Any = 0.0
+    rounds: int = eqx.field(static=True, default=0)
 
     @property
     def rate(self) -> float:
@@ -123,13 +127,23 @@ class Certificate(eqx.Module):
         return noise.w.width @ self.noise_w.T + noise.v.width @ self.noise_v.T + self.noise_fixed
 
     def next_width(self, width: Any, noise: Noise) -> Any:
-        """The recursion ``(I - |N_z| R)^{-1} (A width + b)``, (n,) or a stack (..., n)."""
+        """The recursion ``V (A width + b) + excess``, (n,) or a stack (..., n); V is `inverse`."""
         grown = width @ self.growth.T if self.slices is None else self.slices.growth(width)
-        return (grown + self.noise_width(noise)) @ self._inverse.T
+        return (grown + self.noise_width(noise)) @ self.inverse.T + self.excess
 
     @property
-    def _inverse(self) -> np.ndarray:
-        return np.linalg.inv(np.eye(len(self.growth)) - np.asarray(self.implicit))
+    def inverse(self) -> np.ndarray:
+        """V, (n, n): what so many `rounds` make of ``(I - |N_z| R)^{-1}``, or that itself."""
+        implicit = np.asarray(self.implicit)
+        return (
+            np.linalg.inv(np.eye(len(implicit)) - implicit) if not self.rounds else partial_sum(implicit, self.rounds)
+        )
+
+    @property
+    def response(self) -> np.ndarray:
+        """Derivative (n, n) of `widths` by what one step adds, where `slices` do not count."""
+        V = self.inverse
+        return np.linalg.inv(np.eye(len(V)) - V @ np.asarray(self.growth)) @ V
 
     def widths(self, noise: Noise) -> Any:
         """Steady width (n,) or (..., n) for other noise bounds; all ``inf`` if the recursion does not contract."""
@@ -138,9 +152,10 @@ class Certificate(eqx.Module):
             return np.full(np.shape(added), np.inf)
         settled = np.full(np.shape(added), np.inf)
         if self.slices is None or self.rate < 1:
-            settled = added @ np.linalg.inv(np.eye(len(self.growth)) - self.growth - self.implicit).T
+            V = self.inverse
+            settled = (added @ V.T + self.excess) @ np.linalg.inv(np.eye(len(V)) - V @ self.growth).T
         if self.slices is not None:
-            return self.slices.settled(np.minimum(settled, self.region.width), self._inverse, added)
+            return self.slices.settled(np.minimum(settled, self.region.width), self.inverse, added, self.excess)
         return settled if self.window is None else self.window.settled(settled, noise)
 
     def with_window(self, window: Any, noise: Noise) -> Certificate:
@@ -240,6 +255,15 @@ class Certificate(eqx.Module):
         if not self.region_matters:
             return "Certificate: the widths settle at or below the steady width, from any initial box."
         return "Certificate: while the boxes lie in the region, the widths settle at or below the steady width."
+
+
+def partial_sum(matrix: np.ndarray, terms: int) -> np.ndarray:
+    """``I + M + ... + M^(terms - 1)``."""
+    found = power = np.eye(len(matrix))
+    for _ in range(terms - 1):
+        power = power @ matrix
+        found = found + power
+    return found
 
 
 def spectral_radius(matrix: np.ndarray) -> float:

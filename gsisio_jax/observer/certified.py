@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax.inclusion.atoms import States, wider
-from gsisio_jax.interval.box import Interval, choose, intersect
+from gsisio_jax.interval.box import Interval, center_and_radius, choose, intersect
 from gsisio_jax.interval.image import plain_image
-from gsisio_jax.interval.primitives import matmul
+from gsisio_jax.interval.minmax import cut, raised
+from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.bank import Known
 from gsisio_jax.observer.contractors import Newton, centred_form
 from gsisio_jax.observer.domain import Domain
@@ -19,6 +20,8 @@ from gsisio_jax.observer.maps import Maps, at_point
 from gsisio_jax.observer.measurement import everything_unless, in_box, inside
 from gsisio_jax.observer.status import Source
 from gsisio_jax.observer.types import Carry, RoundingConstants
+
+_UNROLLED = 3  # rounds that are written out
 
 
 class Promised(NamedTuple):
@@ -66,8 +69,66 @@ def certified(
         return at_point(maps.remainder, x, wider(abs(x), maps.terms), *maps.free_at(x, u))
 
     N_z, V, steps = gains.remainder[0], observer.region_inverse, observer.corrections
-    box = centred_form(joint, N_z, V, psi, safe, maps.terms, newton=newton if steps else None, corrections=steps)
-    return domain.intersect(everything_unless(applies, box)[None], Source.CERTIFICATE), promised
+    found = []
+    if steps or not constants.rounds:
+        box = centred_form(joint, N_z, V, psi, safe, maps.terms, newton=newton if steps else None, corrections=steps)
+        safe = Interval.unchecked(raised(safe.lower, box.lower), cut(safe.upper, box.upper))
+        found.append(everything_unless(applies, box))
+    if constants.rounds:
+        whole = _bounded(region, observer.system.state_bounds, right.dtype)
+        box = _recentred(joint, N_z, constants.implicit, psi, safe, whole, maps.terms, constants.rounds)
+        found.append(everything_unless(applies, box))
+    return domain.intersect(jax.tree.map(lambda *sides: jnp.stack(sides), *found), Source.CERTIFICATE), promised
+
+
+def _bounded(region: Interval, bounds: Interval, dtype: Any) -> Interval:
+    """The part of the region within the state bounds; 0 for a state without bounds, on which psi does not depend."""
+    lower, upper = raised(region.lower, bounds.lower), cut(region.upper, bounds.upper)
+    known = jnp.isfinite(lower) & jnp.isfinite(upper)
+    return Interval.unchecked(*(jnp.where(known, side, 0).astype(dtype) for side in (lower, upper)))
+
+
+def _recentred(
+    right: Interval, N_z: Any, implicit: Any, remainder: Any, within: Interval, whole: Interval, terms: int, rounds: int
+) -> Interval:
+    """Bound x, where ``x + N_z psi(x) in right`` and x lies in `within`, about the middle of what is left of that.
+
+    With ``mid +- rad = right`` and b the middle of a box of radius rho, ``|x - (mid - N_z psi(b))|`` is at most
+    ``rad + |N_z| R rho``: whatever b misses of the solution, the new box is no wider than that. The first of several
+    rounds stands on the middle of the region: its psi is a constant, if g takes no known input.
+
+    Args:
+        right: box (n,).
+        N_z: (n, q).
+        implicit: ``|N_z| R`` on `whole`, (n, n).
+        remainder: psi at a point, as center and radius (q,).
+        within: box (n,), finite.
+        whole: box (n,) that holds `within`, finite.
+        terms: of a row, for rounding.
+        rounds: how often, at least 1.
+
+    Source: theory 5.6.
+    """
+    middle, radius = center_and_radius(right)
+    radius = radius + wider(abs(middle) + radius, terms)
+    size = abs(N_z)
+
+    def turn(box: Interval, about: Interval) -> Interval:
+        half = 0.5 * (about.upper - about.lower)
+        value, error = remainder(about.lower + half)
+        center = middle - matmul(N_z, value)
+        far = radius + matmul(size, error) + scale(implicit, half).sum(-1)
+        far = far + wider(abs(center) + abs(middle) + matmul(size, abs(value)) + far, terms)
+        return Interval.unchecked(raised(box.lower, center - far), cut(box.upper, center + far))
+
+    if rounds > 1:
+        within = turn(within, whole)
+        rounds -= 1
+    if rounds <= _UNROLLED:
+        for _ in range(rounds):
+            within = turn(within, within)
+        return within
+    return jax.lax.scan(lambda box, _: (turn(box, box), None), within, None, length=rounds)[0]
 
 
 def _reach(constants: RoundingConstants, before: Interval, promised: Promised) -> tuple[Any, Any]:

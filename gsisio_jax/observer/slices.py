@@ -82,14 +82,15 @@ class Slices(eqx.Module):
         lengths = np.maximum(last - first, 0.0)  # (..., n, 2K+2, K)
         return np.einsum("ijk,...jak->...ija", density, lengths).max(-1)
 
-    def settled(self, start: Any, inverse: np.ndarray, added: np.ndarray) -> np.ndarray:
-        """Widths (..., n) at or below which boxes of the region settle: ``V (growth(width) + added)`` again and again.
+    def settled(self, start: Any, inverse: np.ndarray, added: np.ndarray, excess: Any = 0.0) -> np.ndarray:
+        """Widths (..., n) at or below which boxes of the region settle: ``V (growth(width) + added) + excess`` again
+        and again.
 
         `start`, at most the width of the region, bounds them to begin with. Widths that stay above it do not fit.
         """
         found = np.broadcast_to(start, added.shape)
         for _ in range(_MOST):
-            after = (self.growth(found) + added) @ inverse.T
+            after = (self.growth(found) + added) @ inverse.T + excess
             found, before = np.minimum(found, after), found
             if (before - found <= _SETTLED * before).all():
                 break

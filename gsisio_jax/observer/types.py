@@ -65,6 +65,8 @@ class RoundingConstants(eqx.Module):
             the region, (n, n) and (p, n), rounded up.
         feedthrough: (l, p), how far the H of the promise may be from the one that is written.
         slices: the slopes of the certified gain on parts of the region (`Slices`) in that type, or None.
+        implicit: ``|N_z| R`` of the certified gain on the region, (n, n), rounded up.
+        rounds: how often the certified bound is applied about the middle of what is left; 0 where psi is 0.
         direct: indices of left inverses of [G; H] itself.
 
     Source: theory 10.
@@ -81,6 +83,8 @@ class RoundingConstants(eqx.Module):
     feedthrough: Any
     direct: tuple[int, ...] = eqx.field(static=True)
     slices: Any = None
+    implicit: Any = None
+    rounds: int = eqx.field(static=True, default=0)
 
 
 class ExactInputs(eqx.Module):

@@ -166,11 +166,10 @@ def _weights(observer: Observer, shape: Shape, objective: str, given: Mapping[st
         raise ValueError(
             'tune_noise: objective="widths" needs a certificate, and this design has none; use objective="bounds"'
         )
-    # The steady width is linear in the noise: (I - |N_z| R - A)^{-1} (|P| dw + (|N_y| + |N_z T2|) dv + what is fixed).
-    per_state = np.linalg.inv(np.eye(n) - np.asarray(certificate.growth) - np.asarray(certificate.implicit))
+    # The steady width is linear in the noise, which adds |P| dw + (|N_y| + |N_z T2|) dv + what is fixed in a step.
     added = np.concatenate([np.asarray(certificate.noise_w), np.asarray(certificate.noise_v)], axis=1)
     steady = np.asarray(certificate.widths(shape.template))
-    return np.asarray(given.get("state", 1 / np.where(steady > 0, steady, 1)), float) @ per_state @ added
+    return np.asarray(given.get("state", 1 / np.where(steady > 0, steady, 1)), float) @ certificate.response @ added
 
 
 def _start(shape: Shape, start: TunedNoise | Noise | None) -> np.ndarray:

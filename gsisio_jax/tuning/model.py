@@ -76,6 +76,6 @@ def with_model(observer: Observer, system: System) -> Observer:
     return replace(
         changed,
         certificate=replace(certificate, growth=growth, implicit=implicit, input_state_before=before),
-        rounding_constants=replace(observer.rounding_constants, growth=growth, input_growth=before),
+        rounding_constants=replace(observer.rounding_constants, growth=growth, input_growth=before, implicit=implicit),
         region_inverse=jnp.linalg.inv(jnp.eye(n, dtype=growth.dtype) - implicit),
     )

@@ -144,13 +144,13 @@ def _certificate(observer: Observer, noise: Noise, model: Any, parameters: Any, 
     slope = np.full((n + p, n + l + n + len(parameters)), np.nan)
     if not certificate.certified:
         return width, slope
-    growth, implicit, by_w, by_v, now, before, input_v = (
+    by_w, by_v, now, before, input_v = (
         np.asarray(a) for a in (
-            certificate.growth, certificate.implicit, certificate.noise_w, certificate.noise_v,
+            certificate.noise_w, certificate.noise_v,
             certificate.input_state_now, certificate.input_state_before, certificate.input_noise_v,
         )
     )  # fmt: skip
-    state = np.linalg.inv(np.eye(n) - growth - implicit) @ np.concatenate([by_w, by_v], axis=1)
+    state = certificate.response @ np.concatenate([by_w, by_v], axis=1)
     inputs = (now + before) @ state + np.concatenate([now, input_v], axis=1)
     slope[:, : n + l] = np.concatenate([state, inputs])
     slope[:, n + l : n + l + n] = 0

@@ -35,7 +35,7 @@ def test_suggestions_of_a_plant_without_an_observer_work_and_the_others_do_not()
     head, *lines = str(error.value).splitlines()
     assert "delay=1" in head
     assert lines == [
-        "Tried one by one, each of these is enough:",
+        "Tried one by one (no two of them together), each of these is enough:",
         "  measure state 2 as well: widths settle;",
         "  `input_bounds` with two finite sides for input 1: widths settle;",
         "  `state_bounds` with two finite sides for state 2: widths settle.",

@@ -15,7 +15,6 @@ import gsisio_jax as gx
 ROUNDING = 1e-6
 # Share by which some width is larger at some step with more known, as measured.
 LEFT = {
-    ("sir", "state bounds"): 1e-2,  # rows over several steps are chosen on simulated runs, which the bounds change
     ("paper", "state bounds"): 1e-3,
     ("paper", "input bounds"): 5e-3,
     ("unicycle", "initial box"): 2e-5,

@@ -121,6 +121,43 @@ def test_a_wrong_rate_is_a_conflict_and_lost_rows_are_none(rated):
     assert np.isfinite(np.asarray(gap.input.width)[15:20]).all()  # a rate carries the box through the gap
 
 
+def test_a_gross_fault_that_is_held_is_a_lost_row(rated):
+    """`on_conflict="hold"`: boxes of inputs and states are those of the record without the row that lies."""
+    observer, x, d, y, _ = rated
+    faulty, lost = y[0].copy(), y[0].copy()
+    faulty[20] += 50.0
+    lost[20] = np.nan
+    held = jax.jit(jax.vmap(partial(gx.estimate, observer, INITIAL, on_conflict="hold")))(np.stack([faulty, lost]))
+    assert np.flatnonzero(np.asarray(held.status)[0] & gx.Status.CONFLICT).tolist() == [20]
+    assert not (np.asarray(held.status)[1] & gx.Status.CONFLICT).any()
+    for run in (0, 1):
+        one = jax.tree.map(lambda part, run=run: part[run], held)
+        assert misses(one.state, x[0]) == 0
+        assert misses(one.input, d[0]) == 0
+    np.testing.assert_allclose(held.state.width[0], held.state.width[1], rtol=1e-9)
+    np.testing.assert_allclose(held.input.width[0, 22:], held.input.width[1, 22:], rtol=1e-9)
+
+
+def test_two_inputs_one_of_them_in_the_outputs():
+    """H != 0 and a rate for each input: boxes hold, and are no wider than without."""
+    G2, H2 = np.hstack([G, np.zeros((2, 1))]), np.array([[0.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
+    C, v = np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([0.1, 0.1, 0.1])
+    noise = gx.Noise(Interval.symmetric(W), Interval.symmetric(v))
+    rng = np.random.default_rng(3)
+    d = np.array([3.0, -2.0]) + np.cumsum(rng.uniform(-1, 1, (T - 1, 2)) * [0.02, 0.01], axis=0)
+    widths = []
+    for known in ({"input_rate": [0.02, 0.01]}, {}):
+        system = gx.System(lambda x: A @ x, lambda x: C @ x, G2, H2, **known)
+        run = gx.simulate(system, jax.random.key(0), np.zeros(2), np.vstack([d, d[-1:]]), noise)
+        observer = gx.design_observer(system, noise, Interval.symmetric([5.0, 5.0]), missing=False, sweeps=1)
+        found = gx.estimate(observer, INITIAL, run.y)
+        assert misses(found.state, run.x[:T]) == 0
+        assert misses(found.input, d) == 0
+        widths.append(np.concatenate([np.asarray(found.state.width)[:-1], np.asarray(found.input.width)], 1))
+    assert (widths[0] <= widths[1] * (1 + 1e-9) + 1e-10).all()
+    assert (widths[0][20:, 2:].mean(0) < 0.6 * widths[1][20:, 2:].mean(0)).all()
+
+
 def test_step_by_step_and_from_a_file(rated, blocked, tmp_path):
     observer, _, _, y, found = blocked
     carry, out = gx.start(observer, INITIAL, y[0, 0])

@@ -1,5 +1,7 @@
 """Derivatives through the gain's linear program, and what they are for: noise, region, sensors, cheapest bounds."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,8 +51,10 @@ def test_derivatives_equal_differences_of_designs_solved_anew():
     )
     np.testing.assert_allclose(slopes, differences, rtol=1e-6, atol=1e-6)
     assert (np.abs(differences) > 0.05).all()  # every parameter matters
-    design = gx.design_observer(*plant(theta), missing=False)
-    np.testing.assert_allclose(widths(flat), design.certificate.steady_width, rtol=1e-9)
+    system, noise, region = plant(theta)
+    certificate = gx.design_observer(system, noise, region, missing=False).certificate
+    solved = replace(certificate, rounds=0, excess=0.0)  # what the promise counts besides is no part of the program
+    np.testing.assert_allclose(widths(flat), solved.widths(noise), rtol=1e-9)
 
 
 def test_matrices_must_not_move():

@@ -1,0 +1,59 @@
+"""Rows over several steps that a design without bounds would choose, kept so that a true bound never widens a box.
+
+Which rows a design keeps, and whether it looks back at all, is decided on simulated runs, which bounds of states and
+inputs change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.design.window import window_rows
+from gsisio_jax.observer.window import Window
+
+
+def window_rows_with_less(
+    problem: GainProblem, length: int | str, width: np.ndarray, bank: list[np.ndarray]
+) -> Window | None:
+    """As `window_rows`, with what the same search finds without the bounds of states and inputs."""
+    own = window_rows(problem, length, width, bank)
+    if not (len(problem.ds) or len(problem.dd)):
+        return own
+    everything = np.full(len(problem.free), True)
+    free = replace(problem, C=problem.C[: problem.q], ds=np.zeros(0), dd=np.zeros(0), free=everything)
+    if np.linalg.matrix_rank(free.seen) < free.seen.shape[1]:
+        return own  # there is no observer without the bounds
+    less = window_rows(free, length, width, [N[:, : problem.l + problem.q] for N in bank])
+    return own if less is None else _joined(problem, [less] if own is None else [own, less])
+
+
+def _joined(problem: GainProblem, windows: list[Window]) -> Window:
+    """All rows as those of one window; rows that look back farthest come first, and none comes twice."""
+    steps = max(window.length for window in windows)
+    multipliers = np.concatenate(
+        [np.pad(one.multipliers, ((0, steps - one.length), (0, 0), (0, 0))) for one in windows], axis=1
+    )
+    remainder = np.concatenate([one.remainder for one in windows])
+    targets = [i for one in windows for i in one.targets]
+    kept: list[int] = []
+    for r, target in enumerate(targets):
+        same = (s for s in kept if targets[s] == target)
+        if not any(np.allclose(multipliers[:, s], multipliers[:, r], rtol=1e-7, atol=1e-10) for s in same):
+            kept.append(r)
+    depth = np.array([np.flatnonzero((multipliers[:, r] != 0).any(-1)).max(initial=-1) + 1 for r in kept])
+    order = [kept[k] for k in np.argsort(-depth, kind="stable")]
+    multipliers = multipliers[:, order]
+    stacked = np.vstack([problem.G, problem.H])
+    return Window(
+        multipliers=multipliers,
+        output=np.zeros((len(order), problem.l)),
+        remainder=remainder[order],
+        known=(multipliers @ stacked)[:, :, ~problem.free],
+        left_x=np.zeros((len(order), problem.n)),
+        left_d=np.zeros((steps, len(order), stacked.shape[1])),
+        targets=tuple(targets[r] for r in order),
+        counts=tuple(int((depth > lag).sum()) for lag in range(steps)),
+    )
