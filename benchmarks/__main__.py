@@ -20,7 +20,7 @@ SIZES = {  # full, quick
     "limit stored": ({"batch": 20_480, "steps": 100}, {"batch": 4_096, "steps": 50}),
     "numpy": ({"batch": 2_000, "steps": 100}, {"batch": 1_000, "steps": 20}),
     "tanks": ({"steps": 100}, {"steps": 50}),
-    "peers bounds": ({"boxes": 100_000}, {"boxes": 4_000}),
+    "peers bounds": ({"boxes": 400_000}, {"boxes": 4_000}),
     "peers step": ({"batch": 20_000, "steps": 60, "alone": 40}, {"batch": 2_000, "steps": 20, "alone": 5}),
     "peers numpy": ({"batch": 20_000, "steps": 60, "few": 2_000}, {"batch": 2_000, "steps": 20, "few": 200}),
     "peers horizon": ({"batch": 2_000, "steps": 30, "solved": 5}, {"batch": 200, "steps": 20, "solved": 2}),
