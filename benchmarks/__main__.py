@@ -9,6 +9,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -129,7 +130,11 @@ def setting() -> dict[str, Any]:
         ]
         model = names[0] if names else model
     packages = ("jax", "numpy", "equinox", "gsisio_jax")
+    here = RESULTS.parent.parent
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True)
     return {
+        "date": f"{datetime.now(UTC):%Y-%m-%d}",
+        "commit": commit.stdout.strip(),
         "processor": model,
         "cores": os.cpu_count(),
         "python": platform.python_version(),

@@ -40,7 +40,8 @@ def bounds(boxes: int, peers: str | None) -> dict[str, Any]:
     methods = {
         "natural": inclusion.natural(system.maps),
         "affine": lambda *args: inclusion.affine(system.maps)(*args).range,
-        "affine, nearest": lambda *args: inclusion.affine(system.maps, "nearest")(*args).range,  # as immrax rounds
+        "natural, nearest": inclusion.natural(system.maps, "nearest"),  # as immrax rounds
+        "affine, nearest": lambda *args: inclusion.affine(system.maps, "nearest")(*args).range,
     }
 
     size = boxes // TILES_OF_OURS
