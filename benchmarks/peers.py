@@ -19,7 +19,7 @@ import numpy as np
 
 import gsisio_jax as gx
 from benchmarks import handwritten
-from benchmarks.peers_tools import Peers, Program, boxes_of, one_core, ours_compiled, summary_of, tiled, turns
+from benchmarks.peers_tools import Peers, Program, boxes_of, one_core, ours_compiled, summary_of, turns
 from benchmarks.plants import case, from_tests, records
 from benchmarks.tightness import chain
 from gsisio_jax import Interval, inclusion

@@ -48,17 +48,17 @@ def bounds(given, target):
             starts = range(0, len(lower), size)
             parts = [[jnp.asarray(side[i : i + size]) for side in (lower, upper)] for i in starts]
 
-            def run(keep=lambda bounds: None):
+            def every(keep=lambda bounds: None):
                 for part in parts:
                     keep(jax.block_until_ready(compiled(*part)))
 
-            return run
+            return every
 
         sizes = [int(size) for size in given["tiles"] if len(lower) % size == 0]
-        run = min([tiled(size) for size in sizes], key=lambda run: min(seconds_of(run, time.process_time) for _ in range(TRIES)))
-        programs[name] = run
-        kept = []
-        run(kept.append)
+        tries = {size: tiled(size) for size in sizes}
+        least = {size: min(seconds_of(one, time.process_time) for _ in range(TRIES)) for size, one in tries.items()}
+        programs[name], kept = tries[min(least, key=least.__getitem__)], []
+        programs[name](kept.append)
         found[name] = np.stack([np.concatenate([np.asarray(part[side]) for part in kept]) for side in (0, 1)])
     np.savez(target, **found)
     return programs

@@ -82,7 +82,7 @@ def batched(bounds: Callable[..., Any], shared: bool = True, chunk: int = CHUNK)
         for leaf in [] if shared else jax.tree.leaves(args):
             if leaf.shape[:1] != boxes.shape[:1]:
                 raise ValueError(
-                    f"inclusion.batched: with shared=False every further argument has {boxes.shape[0]} rows, one a box; "
+                    f"inclusion.batched: with shared=False a further argument has {boxes.shape[0]} rows, one a box; "
                     f"got one of shape {leaf.shape}; what holds for all boxes goes with shared=True"
                 )
         return compiled(boxes, args, rounded_outward=outward())
