@@ -52,7 +52,8 @@ def batched(bounds: Callable[..., Any], shared: bool = True, chunk: int = CHUNK)
     def compiled(boxes: Interval, args: tuple[Any, ...], rounded_outward: bool) -> Any:
         """`rounded_outward`: what is in force while this is traced."""
         axes = (0, *([None if shared else 0] * len(args)))
-        every = jax.vmap(lambda box, *rest: call(bounds, box, *rest), axes)
+        # A function of its own at every trace: JAX keeps what it traced of one, whatever rounding is in force.
+        every = jax.vmap(lambda *given: call(lambda *one: bounds(*one), *given), axes)
         number = boxes.shape[0]
         if number <= chunk:
             return every(boxes, *args)
