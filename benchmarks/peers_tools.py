@@ -21,7 +21,7 @@ import numpy as np
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
-TILE, THREADS, ROUNDS = 200, 2, 5  # of such tiles a loop is one function, also for large steps
+TILE, THREADS, ROUNDS = 2000, 2, 5
 MISSING = (
     "not installed; `python -m venv peers && peers/bin/pip install immrax codac`, then `--peers peers/bin/python` here"
 )
