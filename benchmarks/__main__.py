@@ -9,6 +9,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ SIZES = {  # full, quick
     "limit stored": ({"batch": 20_480, "steps": 100}, {"batch": 4_096, "steps": 50}),
     "numpy": ({"batch": 2_000, "steps": 100}, {"batch": 1_000, "steps": 20}),
     "tanks": ({"steps": 100}, {"steps": 50}),
-    "peers bounds": ({"boxes": 100_000}, {"boxes": 4_000}),
+    "peers bounds": ({"boxes": 400_000}, {"boxes": 4_000}),
     "peers step": ({"batch": 20_000, "steps": 60, "alone": 40}, {"batch": 2_000, "steps": 20, "alone": 5}),
     "peers numpy": ({"batch": 20_000, "steps": 60, "few": 2_000}, {"batch": 2_000, "steps": 20, "few": 200}),
     "peers horizon": ({"batch": 2_000, "steps": 30, "solved": 5}, {"batch": 200, "steps": 20, "solved": 2}),
@@ -104,7 +105,8 @@ def run_apart(name: str, quick: bool, against: str | None = None, peers: str | N
     from gsisio_jax.scalar import options  # here: a case may measure what importing takes
 
     # As the command line of the library sets them, unless the user has; before JAX starts.
-    flags = os.environ.get("XLA_FLAGS", options.extended(""))
+    limit = options.ONE_RECORD if name.startswith("plants") else options.LOOP_BYTES
+    flags = os.environ.get("XLA_FLAGS", options.extended("", limit))
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
     done = subprocess.run(command, capture_output=True, text=True, cwd=RESULTS.parent.parent, env=environment)
     if done.returncode:
@@ -129,7 +131,11 @@ def setting() -> dict[str, Any]:
         ]
         model = names[0] if names else model
     packages = ("jax", "numpy", "equinox", "gsisio_jax")
+    here = RESULTS.parent.parent
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True)
     return {
+        "date": f"{datetime.now(UTC):%Y-%m-%d}",
+        "commit": commit.stdout.strip(),
         "processor": model,
         "cores": os.cpu_count(),
         "python": platform.python_version(),

@@ -5,15 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from benchmarks.__main__ import RESULTS, setting
 from benchmarks.plants import from_tests
 
-RESULTS = Path(__file__).parent / "results" / "models.json"
+HEAD = """| Model | n, l, p | design s | first call s | µs a step and box | last widths | missed | certificate |
+| --- | --- | --- | --- | --- | --- | --- | --- |"""
 _REPEAT = 20
 
 
@@ -24,14 +25,13 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     runner, models = from_tests("models.runner"), from_tests("models.gallery").MODELS
     rows = []
-    print("| Model | n, l, p | design s | first call s | µs a step and box | last widths | missed | certificate |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    print(HEAD)
     for name in only or models:
         row = measured(name, models[name](), runner)
         rows.append(row)
         print(line(row), flush=True)
     if not only:
-        RESULTS.write_text(json.dumps(rows, indent=2) + "\n")
+        (RESULTS / "models.json").write_text(json.dumps({"setting": setting(), "results": rows}, indent=2) + "\n")
 
 
 def measured(name: str, model: Any, runner: Any) -> dict[str, Any]:

@@ -8,6 +8,7 @@ of turns.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -18,41 +19,48 @@ import numpy as np
 
 import gsisio_jax as gx
 from benchmarks import handwritten
-from benchmarks.peers_tools import Peers, Program, boxes_of, ours_compiled, summary_of, tiled, turns
+from benchmarks.peers_tools import Peers, Program, boxes_of, one_core, ours_compiled, summary_of, turns
 from benchmarks.plants import case, from_tests, records
 from benchmarks.tightness import chain
 from gsisio_jax import Interval, inclusion
-from gsisio_jax.scalar import call
 
-TILE_OF_BOUNDS = 10_000  # of these there is less to do for a box
-ROUNDS_OF_BOUNDS = 40  # each takes some hundredths of a second
+TILES = 1_000, 2_000, 10_000  # boxes that immrax gets at a time: the fastest of these sizes, for each of its methods
+TILES_OF_OURS = 2  # of what size hardly matters: inside, boxes are bounded in chunks
+ROUNDS_OF_BOUNDS = 25  # each takes a second
 LOOSER = 1e-6  # relative; what counts as bounds of equal width
 HORIZON = 10
 
 
 def bounds(boxes: int, peers: str | None) -> dict[str, Any]:
-    """Bounds of f and g of S1 on many boxes, by every method of both libraries."""
+    """Bounds of f and g of S1 on many boxes, by every method of both libraries; a core each, in processor time."""
+    one_core()
     system, rng = case("s1", 1).system, np.random.default_rng(0)
     centre, radius = rng.uniform(-2, 2, (boxes, 2)), rng.uniform(0.05, 1, (boxes, 2))
     lower, upper, none = centre - radius, centre + radius, np.zeros(0)
     methods = {
         "natural": inclusion.natural(system.maps),
         "affine": lambda *args: inclusion.affine(system.maps)(*args).range,
-        "affine, nearest": lambda *args: inclusion.affine(system.maps, "nearest")(*args).range,  # as immrax rounds
+        "natural, nearest": inclusion.natural(system.maps, "nearest"),  # as immrax rounds
+        "affine, nearest": lambda *args: inclusion.affine(system.maps, "nearest")(*args).range,
     }
 
-    def program(method: Callable[..., Any]) -> Program:
-        def one(low: Any, high: Any) -> Any:
-            return call(lambda low, high: method(Interval.unchecked(low, high), none), low, high)
+    size = boxes // TILES_OF_OURS
+    starts = range(0, boxes, size)
+    parts = [Interval.unchecked(*(jnp.asarray(side[i : i + size]) for side in (lower, upper))) for i in starts]
 
-        size = min(TILE_OF_BOUNDS, boxes)
-        compiled = jax.jit(jax.vmap(one)).lower(lower[:size], upper[:size]).compile()
-        return tiled(boxes, lambda tile: compiled(lower[tile], upper[tile]), size)
+    def program(method: Callable[..., Any]) -> tuple[Program, np.ndarray]:
+        many = inclusion.batched(method)
 
-    ours = {name: program(method) for name, method in methods.items()}
-    sides = {name: boxes_of(run()) for name, run in ours.items()}
-    with Peers("bounds", peers, lower=lower, upper=upper, tile=min(TILE_OF_BOUNDS, boxes)) as other:
-        seconds = turns(ours, other, ROUNDS_OF_BOUNDS)
+        def run() -> None:
+            for part in parts:  # bounds are used and dropped
+                jax.block_until_ready(many(part, none))
+
+        return run, boxes_of([many(part, none) for part in parts])
+
+    both = {name: program(method) for name, method in methods.items()}
+    ours, sides = ({name: pair[i] for name, pair in both.items()} for i in (0, 1))
+    with Peers("bounds", peers, lower=lower, upper=upper, tiles=np.array(TILES)) as other:
+        seconds = turns(ours, other, ROUNDS_OF_BOUNDS, time.process_time)
         sides |= other.found
     points = rng.uniform(lower, upper)
     values = np.asarray(jax.vmap(lambda x: system.maps(x, none))(points))

@@ -69,14 +69,22 @@ def boxes_of(parts: list[Any]) -> np.ndarray:
     )
 
 
-def turns(programs: dict[str, Program], peers: Peers | None, rounds: int = ROUNDS) -> dict[str, float]:
+def one_core() -> None:
+    """This process and what it starts, from before JAX counts cores: so that other load falls on both sides alike."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def turns(
+    programs: dict[str, Program], peers: Peers | None, rounds: int = ROUNDS, clock: Program = time.perf_counter
+) -> dict[str, float]:
     """Median seconds of each, one after the other in every round."""
     seconds: dict[str, list[float]] = {}
     for _ in range(rounds):
         for name, run in programs.items():
-            started = time.perf_counter()
+            started = clock()
             run()
-            seconds.setdefault(name, []).append(time.perf_counter() - started)
+            seconds.setdefault(name, []).append(clock() - started)
         for name, value in peers.timed().items() if peers is not None else ():
             seconds.setdefault(name, []).append(value)
     return {name: float(np.median(values)) for name, values in seconds.items()}

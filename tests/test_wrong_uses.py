@@ -361,6 +361,25 @@ MAPS = {
     "index beyond": (plant(lambda x: jnp.stack([x[0], x[2]])), "System: f reads index 2", "(2,)", "row of G"),
     "index before": (plant(lambda x: jnp.stack([x[0], x[-3]])), "System: f reads index -3", "(2,)"),
     "index in jit": (plant(jax.jit(lambda x: jnp.stack([x[0], x[5]]))), "System: f reads index 5", "(2,)"),
+    "indices beyond": (plant(lambda x: x[np.array([0, 7])]), "System: f reads index 7", "(2,)", "row of G"),
+    "indices before": (plant(lambda x: x[jnp.array([-3, 1])]), "System: f reads index -3", "(2,)"),
+    "indices in jit": (plant(jax.jit(lambda x: x[np.array([0, 7])])), "System: f reads index 7", "(2,)"),
+    "indices in vmap": (
+        plant(lambda x: jax.vmap(lambda i: x[i])(jnp.array([0, 5]))),
+        "System: f reads index 5",
+        "(2,)",
+    ),
+    "taken beyond": (plant(lambda x: x * jnp.take(x, 7)), "System: f reads index 7", "(2,)"),
+    "of a table": (plant(lambda x: x * jnp.arange(5.0)[jnp.array([9, 1])]), "System: f reads index 9", "(5,)"),
+    "of a matrix": (
+        plant(lambda x: jnp.outer(x, x)[np.array([0, 1]), np.array([0, 2])]),
+        "System: f reads index 2",
+        "(2, 2)",
+    ),
+    "along an axis": (plant(lambda x: jnp.take_along_axis(x, np.array([0, 3]), 0)), "System: f reads index 3", "(2,)"),
+    "by a call": (plant(lambda x: x * jax.lax.dynamic_index_in_dim(x, 4, 0, False)), "System: f reads index 4", "(2,)"),
+    "set beyond": (plant(lambda x: x.at[7].set(1.0)), "System: f reads index 7", "(2,)"),
+    "added beyond": (plant(lambda x: x.at[np.array([0, 7])].add(1.0)), "System: f reads index 7", "(2,)"),
     "u beyond": (plant(lambda x, u: x + u[1], m=1), "System: f reads index 1", "(1,)", "per known input"),
     "g beyond": (plant(g=lambda x: x[2]), "System: g reads index 2", "(2,)"),
     "key around": (
@@ -490,3 +509,8 @@ def test_indices_inside_are_taken():
     assert plant(lambda x: x[0:7])(None).n == 2
     assert plant(lambda x: jnp.roll(x, 1))(None).n == 2
     assert plant(lambda x: x[jnp.array([1, 0])])(None).n == 2
+    assert plant(lambda x: x[np.array([1, -1])])(None).n == 2
+    assert plant(lambda x: x.at[np.array([1, -2])].add(1.0))(None).n == 2
+    for asked in ("clip", "wrap"):
+        assert plant(lambda x, mode=asked: jnp.take(x, np.array([0, 7]), mode=mode))(None).n == 2
+    assert plant(lambda x: jnp.take(x, np.array([0, 7]), mode="fill", fill_value=0.0))(None).n == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -69,13 +70,15 @@ class NoisePart(Part):
     v: Bounds
 
 
-def _count(value: Any) -> Any:
-    if value is not None and value != "auto" and (isinstance(value, bool) or not isinstance(value, int) or value < 1):
-        raise ValueError(f'must be a whole number, at least 1, or "auto"; got {value!r}')
+def _count(value: Any, least: int) -> Any:
+    if value not in (None, "auto") and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+        raise ValueError(f'must be a whole number, at least {least}, or "auto"; got {value!r}')
     return value
 
 
-Count = Annotated[Any, BeforeValidator(_count)]  # a union of types would report every one of them that does not fit
+# A union of types would report every one of them that does not fit.
+Count = Annotated[Any, BeforeValidator(partial(_count, least=1))]
+Delay = Annotated[Any, BeforeValidator(partial(_count, least=0))]
 
 
 class DesignPart(Part):
@@ -86,9 +89,9 @@ class DesignPart(Part):
     certify: bool | None = None
     sweeps: Annotated[int, Field(ge=1)] | None = None
     window: Count = None
-    split: Annotated[int, Field(ge=1)] | Literal["auto"] | None = None
+    split: Count = None
     cells: Annotated[int, Field(ge=1)] | None = None
-    delay: Annotated[int, Field(ge=0)] | Literal["auto"] | None = None
+    delay: Delay = None
     bounds: Annotated[list[str], Field(min_length=1)] | None = None
     form: Literal["current", "prediction"] | None = None
     left_inverse: Literal["pseudo", "feedthrough", "smallest"] | None = None

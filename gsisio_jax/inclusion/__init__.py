@@ -8,10 +8,12 @@
     remainder(f)(box, *args)       Interval      the best of 2^n such forms for every row
     tight(f)(box, *args)           Interval      exact where signs of df/dx are known, else the best of all
     bound(f, methods)(box, *args)  AffineForm    any choice of these, intersected (paper, Corollary 1)
+    batched(natural(f))(boxes, *args)            any of these on many boxes, compiled for that
 
 Source: theory 9.
 """
 
+from gsisio_jax.inclusion.batches import batched
 from gsisio_jax.inclusion.by_hand import register_bounds
 from gsisio_jax.inclusion.intersection import METHODS, bound
 from gsisio_jax.inclusion.mixed_monotone import (
@@ -32,6 +34,7 @@ __all__ = [
     "AffineForm",
     "UnknownPrimitiveError",
     "affine",
+    "batched",
     "bound",
     "decomposition",
     "decomposition_function",
