@@ -88,8 +88,8 @@ def measured(task: Task) -> list[str]:
         sizes = _sizes(observer)
         said = ", ".join(f"{key}={value!r}" for key, value in dials.items()) or "default"
         if sizes in found:
-            same, *rest = found[sizes]
-            found[sizes] = f"{same}; {said}", *rest
+            same, first, run, width = found[sizes]
+            found[sizes] = f"{same}; {said}", first, run, width
             continue
         run = jax.jit(jax.vmap(lambda box, y, observer=observer: gx.estimate(observer, box, y, task.u).state.width))
         width = np.asarray(run(task.initial, task.y))[:, task.y.shape[1] // 2 :].mean((0, 1))
