@@ -66,6 +66,21 @@ def rotation() -> Plant:
     )
 
 
+def rotation_input() -> Plant:
+    """The same turn, with an unknown input in the state that is measured badly."""
+    turn = rotation()
+    return Plant(turn.A, turn.C, np.array([[0], [1.0]]), np.zeros((2, 1)), turn.w, np.array([0.05, 1]), turn.start)
+
+
+def spring() -> Plant:
+    """A mass on a damped spring, sampled exactly at .1 s; its position is measured, the force is unknown."""
+    moved = expm(0.1 * np.array([[0, 1, 0], [-4, -0.4, 1], [0, 0, 0]]))
+    return Plant(
+        moved[:2, :2], np.array([[1.0, 0]]), moved[:2, 2:], np.zeros((1, 1)), np.array([1e-3, 1e-2]), np.array([0.01]),
+        np.full(2, 1.0),
+    )  # fmt: skip
+
+
 def chain() -> Plant:
     """Three masses in a row between springs, sampled at .2 s; a force on the middle one, a fault of a second sensor."""
     stiffness = 3.0 * np.array([[-2, 1, 0], [1, -2, 1], [0, 1, -2]])
@@ -101,7 +116,8 @@ def full_rank() -> Plant:
 
 
 PLANTS: dict[str, Callable[[], Plant]] = {
-    "rotation": rotation, "chain": chain, "network": network, "full_rank": full_rank,
+    "rotation": rotation, "rotation_input": rotation_input, "spring": spring, "chain": chain, "network": network,
+    "full_rank": full_rank,
 }  # fmt: skip
 
 

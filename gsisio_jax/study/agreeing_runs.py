@@ -23,7 +23,8 @@ ROUNDS = 20  # of programs along the best runs so far, at most
 ENOUGH = 1e-3  # of the width: a side that moved by less was idle
 PATIENCE = 3  # idle rounds, each with a smaller step, that end the search for a side
 SHRINK = 0.1  # of the last step, after an idle round
-FIRST = 10  # programs to find a first run
+FIRST = 20  # programs to find a first run
+SHORTER = 0.5  # of the last step, where it led to a run that does not agree: otherwise two runs may lead to each other
 TOLERANCE = 1e-12  # of the size of a measurement: what rounding may leave of it
 
 
@@ -116,21 +117,24 @@ class AgreeingRuns:
         return RecordProgram(replace(inside, state=near), self.maps.affine(run, inside.u))
 
     def _first(self, inside: Stretch, stretch: Stretch) -> tuple[np.ndarray, np.ndarray] | None:
-        """A run that needs little of the noise: the programs along it, one after the other."""
+        """A run that needs little of the noise: the programs along it, one after the other, in shorter and shorter
+        steps as long as none agrees."""
         with np.errstate(invalid="ignore"):
             center = (inside.state.lower + inside.state.upper) / 2
         x = np.where(np.isfinite(center), center, inside.state.clip(np.zeros_like(center)))
-        best, least = None, np.inf
+        best, least, reach = None, np.inf, np.full(self.n, np.inf)
         for _ in range(FIRST):
-            found = RecordProgram(inside, self.maps.affine(x, inside.u)).middle()
+            found = self._program(inside, x, reach).middle()
             if found.x is None or found.d is None:
                 return best
-            x = found.x
+            moved, x = np.abs(found.x - x).max(0), found.x
             played, agrees = self._played(stretch, x[None], found.d[None])
             if agrees[0]:
                 if found.value > 0.99 * least:
                     return best
                 x, best, least = played[0], (played[0], found.d), found.value
+            elif best is None:
+                reach = SHORTER * moved
         return best
 
     def _played(self, stretch: Stretch, x: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
