@@ -105,8 +105,7 @@ def run_apart(name: str, quick: bool, against: str | None = None, peers: str | N
     from gsisio_jax.scalar import options  # here: a case may measure what importing takes
 
     # As the command line of the library sets them, unless the user has; before JAX starts.
-    limit = options.ONE_RECORD if name.startswith("plants") else options.LOOP_BYTES
-    flags = os.environ.get("XLA_FLAGS", options.extended("", limit))
+    flags = os.environ.get("XLA_FLAGS", options.extended(""))
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
     done = subprocess.run(command, capture_output=True, text=True, cwd=RESULTS.parent.parent, env=environment)
     if done.returncode:

@@ -1,5 +1,8 @@
 """Derivatives of scans over single numbers are those of the same scan over arrays, whatever is mapped."""
 
+import importlib
+import os
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +11,7 @@ import pytest
 from gsisio_jax import scalar
 from gsisio_jax.interval.minmax import cut, larger, smaller
 from gsisio_jax.interval.primitives import scale, times
+from gsisio_jax.scalar import options
 
 RANDOM = np.random.default_rng(0)
 A, B, X = RANDOM.normal(size=3), RANDOM.normal(size=(3, 2)), RANDOM.normal(size=(3, 4))
@@ -70,4 +74,20 @@ def test_no_two_kept_numbers_are_written_by_one_operation():
     assert not [line for line in fusions if " = (" in line], "several results"
     found, expected = compiled(1.0, 2.0), jax.lax.scan(body, (1.0, 2.0), xs)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+
+
+def test_a_step_over_arrays_never_becomes_one_function(monkeypatch):
+    """XLA would write what it sums once for every use: more than 20 GB for the flight's step, with 28 gains."""
+    monkeypatch.setenv("XLA_FLAGS", options.extended(os.environ.get("XLA_FLAGS", "")))
+    monkeypatch.setattr(importlib.import_module("gsisio_jax.scalar.scan"), "MOST_NUMBERS", 0)
+
+    def body(carry, row):
+        return jnp.sin(carry) * carry.sum() + row, carry.sum()
+
+    compiled = jax.jit(lambda x, rows: scalar.scan(body, x, rows)).lower(A, X.T).compile()
+    assert " sort(" in compiled.as_text()  # which a function cannot hold
+    assert "small_call" not in compiled.as_text()
+    found, expected = compiled(A, X.T), jax.lax.scan(body, A, X.T)
+    for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from .._extras import MissingExtra, need
 from .._quiet import hear_interrupts
-from ..scalar.options import LOOP_BYTES, ONE_RECORD, use_flags
+from ..scalar.options import use_flags
 from .errors import Interrupted, UserError, reason
 from .help import EXAMPLES, INIT, MONTE_CARLO, SWEEP
 from .stopping import exit_code
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code.
     """
     options = _parser().parse_args(arguments)
-    use_flags(LOOP_BYTES if options.command in (_sweep, _monte_carlo) else ONE_RECORD)
+    use_flags()
     try:
         code = options.command(options)
         sys.stdout.flush()

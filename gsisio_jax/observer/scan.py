@@ -31,7 +31,7 @@ def scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold
 
     rows = y, u, noise_rows(noise)
     if isinstance(observer, TolerantObserver):  # many copies of one step: over arrays
-        return jax.lax.scan(body, carry, rows, length=y.shape[0])
+        return jax.lax.scan(scalar.in_tasks(body), carry, rows, length=y.shape[0])
     return scalar.scan(body, carry, rows, length=y.shape[0])
 
 

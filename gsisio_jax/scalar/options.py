@@ -12,16 +12,15 @@ import sys
 from functools import cache
 from importlib.metadata import version
 
+XLA_LOOP_BYTES = 1024
+"""The limit of XLA itself."""
+
 LOOP_BYTES = 2**23
 """Bytes that a turn of a loop may touch where XLA makes the whole loop one function. Beyond, and with XLA's own 1,024
 bytes, every fused operation is a task of its own that costs a tenth of a microsecond a turn, however small it is.
 
 Measured for the paper's example (300 operations after fusion, 15 kB a box): one box 18 -> 1.0 microseconds a step and
 2.9 -> 1.2 s to compile; 256 boxes at once .19 -> .11 microseconds a step and box, but twice as long to compile."""
-
-ONE_RECORD = 2**15
-"""The same for runs of one record, enough for steps of two or three states. Not more: with both flags XLA takes more
-than 20 GB for the loop of some larger steps (the flight, 50 rows; with either flag alone 8 to 12 s and .6 GB)."""
 
 
 def loops(limit: int) -> str:
@@ -60,11 +59,11 @@ def fuses() -> bool:
 def loop_bytes() -> int:
     """What XLA_FLAGS allow a loop that becomes one function; XLA's own value where they say nothing."""
     found = re.findall(r"xla_cpu_small_while_loop_byte_threshold=(\d+)", os.environ.get("XLA_FLAGS", ""))
-    return int(found[-1]) if found else 1024
+    return int(found[-1]) if found else XLA_LOOP_BYTES
 
 
-def extended(given: str, limit: int = LOOP_BYTES) -> str:
-    """XLA_FLAGS with `FLAGS` behind those that are given, loops up to `limit`; what is set already stays as it is.
+def extended(given: str) -> str:
+    """XLA_FLAGS with `FLAGS` behind those that are given; what is set already stays as it is.
 
     >>> extended("--xla_dump_to=/tmp/dump") == " ".join(["--xla_dump_to=/tmp/dump", *FLAGS.values()])
     True
@@ -72,15 +71,13 @@ def extended(given: str, limit: int = LOOP_BYTES) -> str:
     given = given.strip()
     if given and not given.startswith("-"):  # the name of a file that holds them
         return given
-    flags = FLAGS | {"xla_cpu_small_while_loop_byte_threshold": loops(limit)}
-    return " ".join([given, *(flag for name, flag in flags.items() if f"{name}=" not in given)]).strip()
+    return " ".join([given, *(flag for name, flag in FLAGS.items() if f"{name}=" not in given)]).strip()
 
 
-def use_flags(limit: int = LOOP_BYTES) -> None:
-    """Put `FLAGS` into XLA_FLAGS, loops up to `limit` bytes a turn, if this XLA knows them. Where JAX has computed
-    something already, that is in vain."""
+def use_flags() -> None:
+    """Put `FLAGS` into XLA_FLAGS, if this XLA knows them. Where JAX has computed something already, that is in vain."""
     given = os.environ.get("XLA_FLAGS", "")
-    wanted = extended(given, limit)
+    wanted = extended(given)
     if wanted != given.strip() and _accepted(wanted):
         os.environ["XLA_FLAGS"] = wanted
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from gsisio_jax.scalar.options import XLA_LOOP_BYTES, loop_bytes
 from gsisio_jax.scalar.primitive import run
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
 from gsisio_jax.scalar.unroll import numbers_in
@@ -40,7 +41,7 @@ def scan(
     carry = jax.tree.map(jnp.asarray, carry)
     traced = _trace(body, carry, one)
     if traced is None:
-        return jax.lax.scan(wrap(body), carry, xs, length=turns)
+        return jax.lax.scan(in_tasks(wrap(body)), carry, xs, length=turns)
     program, consts, structure = traced
     flat_carry = jax.tree.leaves(carry)
     count = sum(math.prod(leaf.shape) for leaf in flat_carry)
@@ -66,6 +67,28 @@ def _apart(entries: Sequence[Any]) -> list[Any]:
     into one operation with several results, which, where a loop is one function, copies them whole at every turn.
     """
     return [jnp.reshape(entry, (1,) * (i % _SHAPES)) for i, entry in enumerate(entries)]
+
+
+def in_tasks(step: Callable[..., Any]) -> Callable[..., Any]:
+    """A step of a scan that XLA does not make one function, whatever XLA_FLAGS allow.
+
+    XLA writes an expression into such a function once for every use of it. Over numbers, uses are few (`repeated`);
+    over arrays they multiply from sum to sum: a step of four states with 28 gains took more than 20 GB to compile. A
+    loop that sorts stays a sequence of tasks.
+    """
+    if loop_bytes() <= XLA_LOOP_BYTES:
+        return step
+
+    def turn(carry: Any, row: Any) -> tuple[Any, Any]:
+        carry, out = step(carry, row)
+        leaves, structure = jax.tree.flatten(carry)
+        i = next(i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.size)
+        number = jax.lax.stop_gradient(leaves[i].ravel()[0])
+        low, high = jax.lax.sort(jnp.stack([number, number + 1]))
+        leaves[i] = jnp.where(low > high, jnp.nan, leaves[i])  # never, which XLA does not know
+        return jax.tree.unflatten(structure, leaves), out
+
+    return turn
 
 
 def call(function: Callable[..., Any], *args: Any) -> Any:

@@ -155,7 +155,7 @@ def test_the_command_line_sets_the_flags_in_time():
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     environment["PYTHONPATH"] = str(Path(gx.__file__).parents[1])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
-    assert done.stdout == f"True 48 {options.ONE_RECORD}\n", done.stderr
+    assert done.stdout == f"True 48 {options.LOOP_BYTES}\n", done.stderr
 
 
 def test_versions_that_are_not_known_are_tried(monkeypatch):
