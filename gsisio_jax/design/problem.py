@@ -133,7 +133,8 @@ class GainProblem:
         z = np.abs(self.T2) @ y
         zs = np.concatenate([z, x[self.bounded_states]])
         stacked = np.vstack([self.G / x[:, None], self.H / y[:, None]])
-        d = 1.0 / np.abs(stacked).max(axis=0, initial=0.0, where=np.ones_like(stacked, dtype=bool))
+        most = np.abs(stacked).max(axis=0, initial=0.0, where=np.ones_like(stacked, dtype=bool))
+        d = 1.0 / np.where(most > 0, most, 1.0)
         return replace(
             self,
             F=self.F / x[:, None] * x,

@@ -39,6 +39,7 @@ def batched(bounds: Callable[..., Any], shared: bool = True, chunk: int = CHUNK)
         ValueError: `chunk` is no whole number of at least 1; the first argument is no box of shape (N, n); a further
             argument lacks the axis of the boxes.
 
+    >>> from gsisio_jax.inclusion import natural
     >>> ranges = batched(natural(lambda x: x[0] * x[1], rounding="nearest"))
     >>> ranges(Interval([[0.0, 1.0], [2.0, 3.0]], [[1.0, 2.0], [3.0, 4.0]]))
     Interval([0. 6.], [ 2. 12.])

@@ -128,7 +128,8 @@ def test_steps_equal_the_scan_and_go_on_from_a_carry():
         carry, out = gx.step(observer, carry, row)
         outs.append(out)
     for side in ("lower", "upper"):
-        np.testing.assert_array_equal(np.stack([getattr(out.state, side) for out in outs]), getattr(whole.state, side))
+        found = np.stack([getattr(out.state, side) for out in outs])
+        np.testing.assert_allclose(found, getattr(whole.state, side), rtol=1e-12)  # a loop may round in other places
 
 
 def test_gradients_are_those_of_differences():
