@@ -21,11 +21,9 @@ from benchmarks.plants import from_tests
 
 C, A = np.array([4.0, 1.0]), np.array([-0.2, 0.5]) * 4 / 2.9  # c'G = a'H, a orthogonal to t
 T, ALONG = np.array([2.5, 1.0]), np.array([1.0, -2.5])  # t'H = 0, and the direction of H d
-NOISE, START, WIDE = (
-    0.2,
-    201,
-    3,
-)  # bound of w and v, points a side of the first grid, steps until the first box is forgotten
+NOISE = 0.2  # bound of w and v
+START = 201  # points a side of the first grid
+WIDE = 3  # steps until the first box is forgotten
 SLACK = 1e-2  # by which the grid may miss the true state
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import jax
 import numpy as np
 
-import gsisio_jax as gx
 from benchmarks import tightness
 from benchmarks.plants import from_tests
 from gsisio_jax.design import window_program
@@ -52,26 +51,19 @@ def plants() -> dict[str, tuple[np.ndarray, ...]]:
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    every = plants()
-    _designed(every["rotation"])
+    every, design = plants(), from_tests("recovery_plants").design
+    design(every["rotation"])
     print("| Plant | n, l, p | design s | linear programs | compiled | rows until finite: any state | 1, 2, 3 lost |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name, plant in every.items():
         with Counted() as count:
             started = time.process_time()
-            certificate = _designed(plant).certificate
+            certificate = design(plant).certificate
             seconds = time.process_time() - started
         n, l, p = len(plant[0]), len(plant[1]), plant[2].shape[1]
         rows = [f"{certificate.rows_until_finite(lost).max():.0f}" for lost in (None, 1, 2, 3)]
         print(f"| {name} | {n}, {l}, {p} | {seconds:.1f} | {count.programs} | {count.compiled} | {rows[0]} | "
               f"{', '.join(rows[1:])} |", flush=True)  # fmt: skip
-
-
-def _designed(plant: tuple[np.ndarray, ...]) -> gx.Observer:
-    A, C, G, H, w, v = plant
-    system = gx.System(lambda x: A @ x, lambda x: C @ x, G=G, H=H)
-    noise = gx.Noise(gx.Interval.symmetric(w), gx.Interval.symmetric(v))
-    return gx.design_observer(system, noise, gx.Interval.symmetric(np.full(len(A), 5.0)), certify=False)
 
 
 if __name__ == "__main__":

@@ -53,7 +53,11 @@ PLANTS = {
 
 @cache
 def designed(name):
-    A, C, G, H, w, v = PLANTS[name]
+    return design(PLANTS[name])
+
+
+def design(plant):
+    A, C, G, H, w, v = plant
     system = gx.System(lambda x: A @ x, lambda x: C @ x, G=G, H=H)
     noise = gx.Noise(Interval.symmetric(w), Interval.symmetric(v))
     return gx.design_observer(system, noise, Interval.symmetric(np.full(len(A), 5.0)), certify=False)

@@ -14,7 +14,6 @@ from gsisio_jax.design.dead_beat import (
     NOTHING,
     affine_problem,
     as_recovery,
-    output_units,
     sizes_without_boxes,
     unseen_after,
 )
@@ -51,7 +50,8 @@ def with_anchored_rows(
         return observer, certificate
     nothing = np.zeros(problem.l, bool)
     affine = affine_problem(problem, maps, nothing, nothing)
-    scaled, T2 = affine.scaled(width), np.asarray(observer.T2, np.float64)
+    scaled = affine.scaled(width)
+    H_slack = nearest_feedthrough(np.asarray(observer.T2, np.float64), system.H)
     added: list[Recovery] = []
     steps: list[tuple[float, ...]] = []
     for lost in range(1, n + 1):
@@ -61,9 +61,9 @@ def with_anchored_rows(
             states = np.flatnonzero((first <= after) & (after < now))
             if not states.size:
                 continue
-            rows = _rows(affine, maps, width, lost, after, states)
+            rows = _rows(affine, scaled, maps, width, lost, after, states)
             if rows is not None:
-                rows = stored_recovery(rows, observer, system, maps, nearest_feedthrough(T2, system.H), np.float64)
+                rows = stored_recovery(rows, observer, system, maps, H_slack, np.float64)
             if rows is None:  # what cancels has no bound; it may have one a row later
                 first[states] = after + 1
             else:
@@ -97,14 +97,20 @@ def rows_until_finite(problem: GainProblem, lost: int) -> np.ndarray:
 
 
 def _rows(
-    affine: GainProblem, maps: AffineMaps, width: np.ndarray, lost: int, after: int, states: np.ndarray
+    affine: GainProblem,
+    scaled: GainProblem,
+    maps: AffineMaps,
+    width: np.ndarray,
+    lost: int,
+    after: int,
+    states: np.ndarray,
 ) -> Recovery | None:
     """The row of least noise for each of these states, from the box in front of so many lost rows, the measurement of
     that step, and those `after` the gap besides y[k]; None where there is none for one of them."""
     n, l, N = affine.n, affine.l, lost + after + 1
     gap, seen = slice(1, lost + 1), np.ones(N, bool)
     seen[gap] = False
-    whole = WindowProgram.of(affine.scaled(width), N, N)
+    whole = WindowProgram.of(scaled, N, N)
     # No weight on the boxes since, nor on what was lost.
     vanish = np.zeros(len(whole.parts), bool)
     vanish[n : N * n] = True
@@ -116,7 +122,7 @@ def _rows(
         equal=np.vstack([whole.parts[vanish], whole.equal]),
         equal_offset=np.vstack([whole.offset[vanish], whole.equal_offset]),
     )
-    size = np.concatenate([np.full(N * n, _BOX), sizes_without_boxes(affine, maps, width, N)])[~vanish]
+    size = np.concatenate([np.full(N * n, _BOX), sizes_without_boxes(affine, scaled, maps, width, N)])[~vanish]
     rows, radius = Rows([], []), {}
     for state in states:
         row = program.best(state, size, np.zeros_like(size))
@@ -127,7 +133,7 @@ def _rows(
         rows.parts.append(parts)
         rows.states.append(int(state))
         radius[int(state)] = row[1]
-    scales = np.tile(1 / np.concatenate([width, output_units(affine)]), (N + 1, 1))
+    scales = np.tile(1 / np.concatenate([width, affine.output_units]), (N + 1, 1))
     scales[:N, n:][~seen[::-1]] = 0
     found = as_recovery(affine, N, rows, radius, width, scales)
     # On the box: what the equations of its step leave, but for what the program made 0.

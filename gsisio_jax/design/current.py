@@ -21,8 +21,8 @@ from gsisio_jax.design.gain_selection import (
     gains_without_state_bounds,
     profile_at,
     profile_bank,
+    profile_of,
     typical_width,
-    units,
 )
 from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.gains_with_less import gains_with_less
@@ -108,8 +108,7 @@ def design_current(
             observer, system, first.slopes, everywhere, outputs, slack, maps, np.float64, slices
         )  # fmt: skip
 
-    steady = problem.steady_width(main)
-    width = units(steady) if np.isfinite(steady).all() else typical_width(problem, box)
+    width = profile_of(problem, problem.steady_width(main), box)
     if dials.gains == "auto":
         bank = grown(
             [main],

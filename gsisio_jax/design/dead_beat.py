@@ -43,14 +43,14 @@ def dead_beat_rows(
         return ()
     before, now = (np.isin(np.arange(l), list(outputs)) for outputs in lost or ((), ()))
     affine = affine_problem(problem, maps, before, now)
-    scaled, y = affine.scaled(width), output_units(problem)
+    scaled, y = affine.scaled(width), problem.output_units
     determined = steps_until_determined(scaled)
     found, waiting = [], [i for i in range(n) if np.isfinite(determined[i])]
     for steps in range(n + 1 if lost is None else 2):
         if not waiting:
             break
         program = _without_boxes(scaled, steps)
-        size = sizes_without_boxes(affine, maps, width, steps)
+        size = sizes_without_boxes(affine, scaled, maps, width, steps)
         rows, radius = Rows([], []), {}
         for state in [i for i in waiting if determined[i] <= steps]:
             row = program.best(state, size, np.zeros_like(size))
@@ -102,20 +102,17 @@ def affine_problem(problem: GainProblem, maps: AffineMaps, before: np.ndarray, n
     return replace(problem, F=F, E=E, H=H, C=np.vstack([Z, problem.C[problem.q :]]))
 
 
-def sizes_without_boxes(problem: GainProblem, maps: AffineMaps, width: np.ndarray, steps: int) -> np.ndarray:
-    """Half widths of what is known of the equations of a window, over their units; for a `WindowProgram` in units of
-    these widths, without slopes on boxes."""
-    scaled, y = problem.scaled(width), output_units(problem)
+def sizes_without_boxes(
+    problem: GainProblem, scaled: GainProblem, maps: AffineMaps, width: np.ndarray, steps: int
+) -> np.ndarray:
+    """Half widths of what is known of the equations of a window, over their units; for a `WindowProgram` of the problem
+    `scaled` to these widths, without slopes on boxes."""
+    y = problem.output_units
     units = np.concatenate([width, y, np.abs(problem.T2) @ y])
     of_f, of_g, of_z = np.split(maps.radius / units, [problem.n, problem.n + problem.l])
     of_f, of_g = of_f + scaled.dw / 2, of_g + scaled.dv / 2
     size = np.concatenate([*[of_f] * steps, *[of_g] * steps, scaled.dv / 2, of_z, *[scaled.dd / 2] * steps])
     return np.where(size > 0, size, 1e-6)
-
-
-def output_units(problem: GainProblem) -> np.ndarray:
-    """Units of the outputs, (l,)."""
-    return np.where(problem.dv > 0, problem.dv, 1.0)
 
 
 def _kernel(matrix: np.ndarray) -> np.ndarray:
@@ -141,8 +138,9 @@ def as_recovery(
     else:
         targets = tuple(rows.states)
         multipliers, known = np.zeros((0, R, n + l)), np.zeros((0, R, len(problem.dd)))
-        y = np.where(problem.dv > 0, problem.dv, 1.0)
-        remainder = width[list(targets), None] * np.array(rows.parts)[:, l:] / (np.abs(problem.T2) @ y)
+        remainder = (
+            width[list(targets), None] * np.array(rows.parts)[:, l:] / (np.abs(problem.T2) @ problem.output_units)
+        )
     return Recovery(
         multipliers=multipliers,
         output=np.zeros((R, l)),

@@ -75,7 +75,7 @@ def profile_bank(problem: GainProblem, main: np.ndarray, region: Interval, count
 def profile_at(problem: GainProblem, main: np.ndarray, region: Interval, share: float) -> np.ndarray | None:
     """The gain for boxes of the steady width (share 0), of the region (1), of a hundredth of the steady width (-1)."""
     steady = problem.steady_width(main)
-    steady = units(steady) if np.isfinite(steady).all() else typical_width(problem, region)
+    steady = profile_of(problem, steady, region)
     width = np.asarray(region.width)
     largest = np.where(np.isfinite(width), np.maximum(width / steady, 2.0), 100.0)
     profile = steady * np.where(share < 0, 100.0, largest) ** share
@@ -117,8 +117,7 @@ def gains_without_state_bounds(problem: GainProblem, main: np.ndarray, region: I
     """
     if not len(problem.ds):
         return []
-    steady = problem.steady_width(main)
-    profile = 0.1 * (units(steady) if np.isfinite(steady).all() else typical_width(problem, region))
+    profile = 0.1 * profile_of(problem, problem.steady_width(main), region)
     found = []
     for measured in (True, False):
         usable = np.full(problem.columns, True)
@@ -145,6 +144,17 @@ def typical_width(problem: GainProblem, region: Interval) -> np.ndarray:
     with np.errstate(all="ignore"):
         resolved = np.abs(np.linalg.pinv(problem.E)) @ problem.dv + problem.dw if problem.l else problem.dw
     return np.where(np.isfinite(width) & (width > 0), width, units(resolved))
+
+
+def profile_of(problem: GainProblem, steady: np.ndarray, region: Interval) -> np.ndarray:
+    """Steady widths as units, (n,); the typical ones where some do not settle."""
+    return units(steady) if np.isfinite(steady).all() else typical_width(problem, region)
+
+
+def with_rows(main: np.ndarray, rows: list[list[np.ndarray]]) -> list[np.ndarray]:
+    """As few gains as hold further rows, given for every state; a gain has that of `main` where there is no other."""
+    count = max(map(len, rows), default=0)
+    return [np.stack([mine[k] if k < len(mine) else main[i] for i, mine in enumerate(rows)]) for k in range(count)]
 
 
 def units(width: np.ndarray) -> np.ndarray:

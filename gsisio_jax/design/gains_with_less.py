@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsisio_jax.design.gain_selection import main_gain, typical_width, units
+from gsisio_jax.design.gain_selection import main_gain, profile_of, with_rows
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
@@ -34,8 +34,7 @@ def gains_with_less(problem: GainProblem, bank: list[np.ndarray], region: Interv
         certified row for a state of which there is no other.
     """
     main = bank[0]
-    steady = problem.steady_width(main)
-    width = units(steady) if np.isfinite(steady).all() else typical_width(problem, region)
+    width = profile_of(problem, problem.steady_width(main), region)
     rows: list[list[np.ndarray]] = [[] for _ in range(problem.n)]
     for less, usable in _cases(problem):
         try:
@@ -46,8 +45,7 @@ def gains_with_less(problem: GainProblem, bank: list[np.ndarray], region: Interv
             known = [*(kept[i] for kept in bank), *rows[i]]
             if not any(_same(gain[i], row) for row in known) and _helps(problem, gain, main, i, width):
                 rows[i].append(gain[i])
-    count = max(map(len, rows), default=0)
-    return [np.stack([mine[k] if k < len(mine) else main[i] for i, mine in enumerate(rows)]) for k in range(count)]
+    return with_rows(main, rows)
 
 
 def _cases(problem: GainProblem) -> Iterator[tuple[GainProblem, np.ndarray]]:

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsisio_jax.design.gain_selection import main_gain, typical_width, units
+from gsisio_jax.design.gain_selection import main_gain, profile_of, with_rows
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window_program import rows_of_gains
 from gsisio_jax.design.window_runs import Runs
@@ -39,9 +39,8 @@ def gains_without_outputs(problem: GainProblem, bank: list[np.ndarray], region: 
     if not 2 <= l <= _MOST_OUTPUTS:
         return []
     main = bank[0]
-    steady = problem.steady_width(main)
-    width = units(steady) if np.isfinite(steady).all() else typical_width(problem, region)
-    kept = [bank_of_runs(problem, bank, width)]
+    width = profile_of(problem, problem.steady_width(main), region)
+    now = _widths(problem, bank, width)
     rows: list[list[np.ndarray]] = [[] for _ in range(problem.n)]
     for j in range(l):
         gain = _without(problem, j, region)
@@ -49,24 +48,19 @@ def gains_without_outputs(problem: GainProblem, bank: list[np.ndarray], region: 
             continue
         for i in range(problem.n):
             tried = np.where((np.arange(problem.n) == i)[:, None], gain, main)
-            reached = bank_of_runs(problem, [*bank, *_joined(rows, main), tried], width)
-            if reached[i] < kept[-1][i] - _LEAST_GAIN:
+            reached = _widths(problem, [*bank, *with_rows(main, rows), tried], width)
+            if reached[i] < now[i] - _LEAST_GAIN:
                 rows[i].append(gain[i])
-                kept.append(reached)
-    return _joined(rows, main)
+                now = reached
+    return with_rows(main, rows)
 
 
-def bank_of_runs(problem: GainProblem, bank: list[np.ndarray], width: np.ndarray) -> np.ndarray:
+def _widths(problem: GainProblem, bank: list[np.ndarray], width: np.ndarray) -> np.ndarray:
     """Mean logarithm (n,) of the widths of simulated runs with these gains, in units of `width`."""
     scaled = problem.scaled(width)
     rows = rows_of_gains(scaled, [problem.scaled_gain(N, width) for N in bank], 1)
     runs = Runs(scaled, 1, np.full(problem.n, 1.5), np.random.default_rng(0)).of(rows, False)
     return np.mean([np.log(np.maximum(below + above, 1e-12)) for _, _, below, above in runs], (0, 1))
-
-
-def _joined(rows: list[list[np.ndarray]], main: np.ndarray) -> list[np.ndarray]:
-    count = max(map(len, rows), default=0)
-    return [np.stack([mine[k] if k < len(mine) else main[i] for i, mine in enumerate(rows)]) for k in range(count)]
 
 
 def reduced(problem: GainProblem, j: int) -> tuple[GainProblem, np.ndarray]:

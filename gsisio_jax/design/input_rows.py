@@ -34,7 +34,7 @@ def rows_of_inputs(problem: GainProblem, system: System, window: int | str, widt
     Returns:
         None where no row exists.
     """
-    scaled, unit = problem.scaled(width), _units(problem, width)
+    scaled, unit = problem.scaled(width), problem.input_units(width)
     p, rate = len(unit), _rate(system) / unit
     least = window if isinstance(window, int) else 1
     profiles = []
@@ -60,7 +60,7 @@ def rows_of_inputs(problem: GainProblem, system: System, window: int | str, widt
 
 def rows_of_sums(problem: GainProblem, system: System, steps: int, width: np.ndarray) -> InputRows | None:
     """Rows for the sum of each input over the last `steps` steps; arguments and result as `rows_of_inputs`."""
-    scaled, unit = problem.scaled(width), _units(problem, width)
+    scaled, unit = problem.scaled(width), problem.input_units(width)
     sizes = _Sizes(scaled, steps, _rate(system) / unit, np.full(len(unit), FAR), steps)
     found, kept = Rows([], []), []
     _profile_rows(found, sizes, steps)
@@ -197,13 +197,6 @@ def _add(found: Rows, state: int, parts: np.ndarray, sizes: _Sizes) -> None:
         found.add(state, parts)
 
 
-def _units(problem: GainProblem, x: np.ndarray) -> np.ndarray:
-    """Units (p,) of the inputs in `GainProblem.scaled`."""
-    y = np.where(problem.dv > 0, problem.dv, 1.0)
-    stacked = np.vstack([problem.G / x[:, None], problem.H / y[:, None]])
-    return 1.0 / np.abs(stacked).max(axis=0)
-
-
 def _as_rows(
     problem: GainProblem, length: int, rows: Rows, kept: list[int], x: np.ndarray, d: np.ndarray, over: int = 1
 ) -> InputRows:
@@ -213,7 +206,7 @@ def _as_rows(
     targets = np.array([rows.states[r] for r in kept])
     sizes = [N * n, n, N * n, N * l, N * p, N * p]
     _, _, *found = np.split(parts, np.cumsum(sizes)[:-1], axis=1)
-    own, y = d[targets][:, None], np.where(problem.dv > 0, problem.dv, 1.0)
+    own, y = d[targets][:, None], problem.output_units
     units = [x, y, d, d]
     of_f, of_g, moves, boxes = (
         own[None] * part.reshape(R, N, len(unit)).transpose(1, 0, 2)[::-1] / unit

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.feedthrough import factorise
-from gsisio_jax.design.gain_selection import typical_width, units
+from gsisio_jax.design.gain_selection import profile_of
 from gsisio_jax.design.input_rows import rows_of_sums
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, is_concrete
@@ -98,8 +98,7 @@ def _rows(observer: Observer, steps: int) -> InputRows | None:
     if not slopes.finite:
         return None
     problem = Plan(system, observer.noise, feedthrough, observer.u_region).problem(slopes)
-    steady = np.asarray(certificate.steady_width)
-    width = units(steady) if np.isfinite(steady).all() else typical_width(problem, certificate.region)
+    width = profile_of(problem, np.asarray(certificate.steady_width), certificate.region)
     rows = rows_of_sums(problem, system, steps, width)
     H_slack = nearest_feedthrough(np.asarray(observer.T2, np.float64), np.asarray(system.H))
     dtype = np.asarray(observer.T2).dtype

@@ -129,12 +129,9 @@ class GainProblem:
 
     def scaled(self, x: np.ndarray) -> GainProblem:
         """The same problem in units `x` of the states, (n,), and in units of the noise for the outputs."""
-        y = np.where(self.dv > 0, self.dv, 1.0)
+        y, d = self.output_units, self.input_units(x)
         z = np.abs(self.T2) @ y
         zs = np.concatenate([z, x[self.bounded_states]])
-        stacked = np.vstack([self.G / x[:, None], self.H / y[:, None]])
-        most = np.abs(stacked).max(axis=0, initial=0.0, where=np.ones_like(stacked, dtype=bool))
-        d = 1.0 / np.where(most > 0, most, 1.0)
         return replace(
             self,
             F=self.F / x[:, None] * x,
@@ -153,6 +150,16 @@ class GainProblem:
         )
 
     @property
+    def output_units(self) -> np.ndarray:
+        """Units (l,) of the outputs in `scaled`."""
+        return np.where(self.dv > 0, self.dv, 1.0)
+
+    def input_units(self, x: np.ndarray) -> np.ndarray:
+        """Units (p,) of the inputs in `scaled`; 1 for one that nothing shows."""
+        most = np.abs(np.vstack([self.G / x[:, None], self.H / self.output_units[:, None]])).max(axis=0, initial=0.0)
+        return 1.0 / np.where(most > 0, most, 1.0)
+
+    @property
     def nonlinear(self) -> bool:
         """Slopes vary."""
         return any(radius.any() for radius in (self.F_radius, self.E_radius, self.R))
@@ -167,7 +174,7 @@ class GainProblem:
 
     def unscale(self, N: np.ndarray, x: np.ndarray) -> np.ndarray:
         """A gain of `scaled(x)` in the original units."""
-        y = np.where(self.dv > 0, self.dv, 1.0)
+        y = self.output_units
         columns = np.concatenate([y, np.abs(self.T2) @ y, x[self.bounded_states]])
         return N * x[:, None] / columns
 

@@ -227,26 +227,37 @@ def as_window(
     sizes = [N * n, N * n, N * l, l, q, N * b]
     _, of_f, of_g, _, remainder, _ = np.split(parts, np.cumsum(sizes)[:-1], axis=1)
     own = x[targets][:, None]
-    y = np.where(problem.dv > 0, problem.dv, 1.0)
+    y = problem.output_units
     z = np.abs(problem.T2) @ y
     of_f = own[None] * of_f.reshape(R, N, n).transpose(1, 0, 2)[::-1] / x
     of_g = own[None] * of_g.reshape(R, N, l).transpose(1, 0, 2)[::-1] / y
     multipliers = np.concatenate([of_f, -of_g], axis=2)
     remainder = own * remainder / z
-    # Rows that look back farthest come first, so that those of a lag are the first ones.
-    depth = np.array([max(np.flatnonzero((multipliers[:, r] != 0).any(-1)), default=-1) + 1 for r in range(R)])
-    order = np.argsort(-depth, kind="stable")
     if shortened:
-        N = max(1, int(depth.max()))  # older steps are in no row that was kept
-    multipliers, remainder = multipliers[:N, order], remainder[order]
+        multipliers = multipliers[: max(1, int(_depths(multipliers).max()))]  # older steps are in no row that was kept
+    return deepest_first(problem, multipliers, remainder, targets)
+
+
+def deepest_first(problem: GainProblem, multipliers: np.ndarray, remainder: np.ndarray, targets: list[int]) -> Window:
+    """Rows in the units of the plant as a window, without what rounding leaves: those that look back farthest come
+    first, so that those of a lag are the first ones."""
+    N, R = multipliers.shape[:2]
+    depth = _depths(multipliers)
+    order = np.argsort(-depth, kind="stable")
+    multipliers = multipliers[:, order]
     stacked = np.vstack([problem.G, problem.H])
     return Window(
         multipliers=multipliers,
-        output=np.zeros((R, l)),
-        remainder=remainder,
+        output=np.zeros((R, problem.l)),
+        remainder=remainder[order],
         known=(multipliers @ stacked)[:, :, ~problem.free],
-        left_x=np.zeros((R, n)),
+        left_x=np.zeros((R, problem.n)),
         left_d=np.zeros((N, R, stacked.shape[1])),
         targets=tuple(targets[r] for r in order),
         counts=tuple(int((depth > lag).sum()) for lag in range(N)),
     )
+
+
+def _depths(multipliers: np.ndarray) -> np.ndarray:
+    """How many steps the rows (R,) look back."""
+    return np.array([np.flatnonzero(row).max(initial=-1) + 1 for row in (multipliers != 0).any(-1).T])

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
-from gsisio_jax.design.window import window_rows
+from gsisio_jax.design.window import deepest_first, window_rows
 from gsisio_jax.observer.window import Window
 
 
@@ -31,7 +31,7 @@ def window_rows_with_less(
 
 
 def _joined(problem: GainProblem, windows: list[Window]) -> Window:
-    """All rows as those of one window; rows that look back farthest come first, and none comes twice."""
+    """All rows as those of one window; none comes twice."""
     steps = max(window.length for window in windows)
     multipliers = np.concatenate(
         [np.pad(one.multipliers, ((0, steps - one.length), (0, 0), (0, 0))) for one in windows], axis=1
@@ -43,17 +43,4 @@ def _joined(problem: GainProblem, windows: list[Window]) -> Window:
         same = (s for s in kept if targets[s] == target)
         if not any(np.allclose(multipliers[:, s], multipliers[:, r], rtol=1e-7, atol=1e-10) for s in same):
             kept.append(r)
-    depth = np.array([np.flatnonzero((multipliers[:, r] != 0).any(-1)).max(initial=-1) + 1 for r in kept])
-    order = [kept[k] for k in np.argsort(-depth, kind="stable")]
-    multipliers = multipliers[:, order]
-    stacked = np.vstack([problem.G, problem.H])
-    return Window(
-        multipliers=multipliers,
-        output=np.zeros((len(order), problem.l)),
-        remainder=remainder[order],
-        known=(multipliers @ stacked)[:, :, ~problem.free],
-        left_x=np.zeros((len(order), problem.n)),
-        left_d=np.zeros((steps, len(order), stacked.shape[1])),
-        targets=tuple(targets[r] for r in order),
-        counts=tuple(int((depth > lag).sum()) for lag in range(steps)),
-    )
+    return deepest_first(problem, multipliers[:, kept], remainder[kept], [targets[r] for r in kept])

@@ -135,9 +135,9 @@ class Certificate(eqx.Module):
     def inverse(self) -> np.ndarray:
         """V, (n, n): what so many `rounds` make of ``(I - |N_z| R)^{-1}``, or that itself."""
         implicit = np.asarray(self.implicit)
-        return (
-            np.linalg.inv(np.eye(len(implicit)) - implicit) if not self.rounds else partial_sum(implicit, self.rounds)
-        )
+        if self.rounds:
+            return partial_sum(implicit, self.rounds)
+        return np.linalg.inv(np.eye(len(implicit)) - implicit)
 
     @property
     def response(self) -> np.ndarray:

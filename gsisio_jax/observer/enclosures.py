@@ -62,14 +62,11 @@ def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) ->
         maps = (system.dynamics, system.measurement, lambda x, u: T2_array @ system.measurement(x, u))
         return [inclusion.jacobian(q)(box, u) for q in maps]
 
-    program: list[Callable[..., list[Interval]]] = []
+    program = _traced_once(enclose)
 
     def on(box: Interval, u: Interval = u_box) -> Slopes:
         with _able_to_hold(dtype):
-            boxes = known(box, dtype), known(u, dtype)
-            if not program:
-                program.append(numpy_function(enclose, *boxes))
-            parts = [_center_and_distance(jacobian) for jacobian in program[0](*boxes)]
+            parts = [_center_and_distance(jacobian) for jacobian in program(known(box, dtype), known(u, dtype))]
         return Slopes(*parts[0], *parts[1], *parts[2])
 
     return on
@@ -96,6 +93,18 @@ def known(box: Interval, dtype: Any) -> Interval:
     lower, upper = (np.asarray(side) for side in (box.lower, box.upper))
     sides = np.asarray(cast_down(lower, dtype)), np.asarray(cast_up(upper, dtype))
     return Interval.unchecked(*rounding.normal(*sides))
+
+
+def _traced_once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`numpy_function` of it, made at the first call, for the shapes and types of all."""
+    program: list[Callable[..., Any]] = []
+
+    def run(*boxes: Interval) -> Any:
+        if not program:
+            program.append(numpy_function(function, *boxes))
+        return program[0](*boxes)
+
+    return run
 
 
 def _able_to_hold(dtype: Any) -> Any:
@@ -130,7 +139,7 @@ def affine_of(
 ) -> Callable[[Interval], tuple[AffineForm, np.ndarray]]:
     """Affine bounds of a function of x and u as a function of the box of x, uniformly over `u_region`, and the slack of
     their slope (q, n); traced once for all boxes, as in `slopes_of`, and computed once for each."""
-    program: list[Callable[..., Any]] = []
+    program = _traced_once(affine_with_slack(function))
     found: dict[bytes, tuple[AffineForm, np.ndarray]] = {}
 
     def on(box: Interval) -> tuple[AffineForm, np.ndarray]:
@@ -138,9 +147,7 @@ def affine_of(
             boxes = known(box, dtype), known(u_region, dtype)
             key = boxes[0].lower.tobytes() + boxes[0].upper.tobytes()
             if key not in found:
-                if not program:
-                    program.append(numpy_function(affine_with_slack(function), *boxes))
-                form, slack = program[0](*boxes)
+                form, slack = program(*boxes)
                 found[key] = form, np.asarray(slack, np.float64)
             return found[key]
 

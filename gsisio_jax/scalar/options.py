@@ -22,15 +22,11 @@ bytes, every fused operation is a task of its own that costs a tenth of a micros
 Measured for the paper's example (300 operations after fusion, 15 kB a box): one box 18 -> 1.0 microseconds a step and
 2.9 -> 1.2 s to compile; 256 boxes at once .19 -> .11 microseconds a step and box, but twice as long to compile."""
 
-
-def loops(limit: int) -> str:
-    """The flag that makes a loop one function up to so many bytes a turn."""
-    return f"--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold={limit}"
-
-
 FLAGS = {
     "xla_cpu_use_multi_output_fusion": "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true",
-    "xla_cpu_small_while_loop_byte_threshold": loops(LOOP_BYTES),
+    "xla_cpu_small_while_loop_byte_threshold": (
+        f"--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold={LOOP_BYTES}"
+    ),
 }
 """By name of what they set: numbers of a step that share what they are computed from are computed together; and the
 recursion over a record is one function (`LOOP_BYTES`).

@@ -237,6 +237,4 @@ def _multipliers(problem: GainProblem, W: np.ndarray) -> tuple[np.ndarray, ...]:
     if equality is None:
         return (*found, np.zeros((inner.n, 0)))
     # Back to the user's units: cost_i / x_i + nu_ij residual_ij d_j / x_i, with d_j the unit of input j.
-    y = np.where(problem.dv > 0, problem.dv, 1.0)
-    unit = 1.0 / np.abs(np.vstack([problem.G / x[:, None], problem.H / y[:, None]])).max(axis=0)
-    return (*found, np.asarray(equality.dual_value).reshape(inner.n, -1) * unit[free])
+    return (*found, np.asarray(equality.dual_value).reshape(inner.n, -1) * problem.input_units(x)[free])
