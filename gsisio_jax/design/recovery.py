@@ -6,6 +6,7 @@ f and g are affine, which boxes are infinite depends on no data, so the trial is
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -53,10 +54,9 @@ def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_reg
         steps, reached = _rows_until_finite(widths), widths[-1]
     around = Interval.unchecked(trial.start - width / 2, trial.start + width / 2)
     found: list[tuple[float, ...]] = []
-    for count in range(1, trial.most_lost + 1):
-        after = trial.rows.copy()
-        after[1 : 1 + count] = np.nan
-        found.append(_plain(_rows_until_finite(trial.widths(around, after)[1 + count :])))
+    # Rows that need no box make every box finite for good.
+    for widths in trial.after_gaps(around, int(steps.max()) + 1 if proved else None):
+        found.append(_plain(_rows_until_finite(widths)))
         if found[-1] == _plain(steps):
             break  # more rows cannot take more than all that was known
     return replace(
@@ -114,19 +114,38 @@ class Trial:
 
     def widths(self, initial: Interval, rows: np.ndarray) -> np.ndarray:
         """Widths of the boxes of all steps, (T, n)."""
+        return self._widths(self._begin(initial), rows)[1][_delay(self.observer) :]
+
+    def after_gaps(self, initial: Interval, most: int | None) -> Iterator[np.ndarray]:
+        """Widths (T, n) of the boxes from the first row on after gaps of 1, 2, ... `most_lost` rows behind the first
+        one; of so many rows at most, or of all that there are."""
+        delay, lost = _delay(self.observer), np.full_like(self.rows[0], np.nan)
+        carry, _ = self._widths(self._begin(initial), self.rows[:1])
+        for count in range(1, self.most_lost + 1):
+            carry, _ = self._widths(carry, [lost])
+            after = self.rows[1 + count :]
+            yield self._widths(carry, after if most is None else after[: most + delay])[1][delay:]
+
+    def _begin(self, initial: Interval) -> Any:
+        """The carry before the first step."""
         with jax.enable_x64(True):
-            begin = known(initial, np.float64)
-            carry = numpy_function(lambda box: blank(self.observer, box), begin)(begin)
+            box = known(initial, np.float64)
+            return numpy_function(lambda box: blank(self.observer, box), box)(box)
+
+    def _widths(self, carry: Any, rows: Any) -> tuple[Any, np.ndarray]:
+        """The carry behind these rows, and the widths that the steps report, (T, n)."""
+        found = []
+        with jax.enable_x64(True):
             if self.step is None:
-                self.step = numpy_function(
-                    lambda c, y, u, noise: advance(self.observer, c, y, u, noise, False),
-                    carry, rows[0], self.u, self.noise,
-                )  # fmt: skip
-            found = []
+                self.step = numpy_function(self._step, carry, rows[0])
             for y in rows:
-                carry, out = self.step(carry, y, self.u, self.noise)
-                found.append(np.asarray(out.state.upper) - np.asarray(out.state.lower))
-        return np.array(found[_delay(self.observer) :])
+                carry, state = self.step(carry, y)
+                found.append(np.asarray(state.upper) - np.asarray(state.lower))
+        return carry, np.array(found)
+
+    def _step(self, carry: Any, y: Any) -> tuple[Any, Interval]:
+        after, out = advance(self.observer, carry, y, self.u, self.noise, False)
+        return after, out.state
 
 
 def _delay(observer: Observer | DelayedObserver) -> int:

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import sparse
-from scipy.optimize import linprog
 
 from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.design.row_solver import RowSolver
 from gsisio_jax.design.window_runs import Rows
 
 _SMALL = 1e-9  # multipliers below this are what a solver leaves, in units of the noise and the boxes
@@ -72,38 +71,19 @@ class WindowProgram:
         return cls(np.vstack(parts), np.vstack(offset), np.vstack(equal), np.vstack(equal_offset))
 
     @cached_property
-    def _constraints(self) -> sparse.csc_array:
-        """Parts as differences of two nonnegative unknowns, and what must vanish."""
-        k = len(self.parts)
-        rows = sparse.hstack([sparse.csr_array(self.parts), -sparse.eye_array(k), sparse.eye_array(k)])
-        if len(self.equal):
-            rows = sparse.vstack([rows, sparse.hstack([self.equal, sparse.csr_array((len(self.equal), 2 * k))])])
-        return sparse.csc_array(rows)
-
-    @cached_property
-    def _bounds(self) -> np.ndarray:
-        """Of these unknowns: as one array, which SciPy reads several times faster than pairs."""
-        k, count = self.parts.shape
-        return np.column_stack([np.repeat([-np.inf, 0.0], [count, 2 * k]), np.full(count + 2 * k, np.inf)])
+    def _solver(self) -> RowSolver:
+        return RowSolver(self.parts, self.equal)
 
     def best(self, state: int, size: np.ndarray, drift: np.ndarray) -> tuple[np.ndarray, float] | None:
         """The parts of the row with the least ``size |parts| + drift parts``, and that; None where there is none."""
-        count = self.parts.shape[1]
-        found = linprog(
-            np.concatenate([np.zeros(count), size + drift, size - drift]),
-            A_eq=self._constraints,
-            b_eq=-np.concatenate([self.offset[:, state], self.equal_offset[:, state]]),
-            bounds=self._bounds,
-            method="highs-ds",
-        )
-        if found.status != 0:
-            return None
-        x = self._exactly_free(found.x[:count], state)
-        if x is None:
+        goal = np.concatenate([self.offset[:, state], self.equal_offset[:, state]])
+        found = self._solver.multipliers(goal, size, drift)
+        x = None if found is None else self._exactly_free(found[0], state)
+        if found is None or x is None:
             return None
         parts = self.parts @ x + self.offset[:, state]
         parts[np.abs(parts) < _SMALL] = 0
-        return parts, found.fun
+        return parts, found[1]
 
     def _exactly_free(self, x: np.ndarray, state: int) -> np.ndarray | None:
         """Small multipliers are 0, and the others moved so that free inputs cancel to rounding."""

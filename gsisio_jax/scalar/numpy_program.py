@@ -33,6 +33,7 @@ def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[...,
     inputs = [program.place() for _ in closed.jaxpr.invars]
     with np.errstate(all="ignore"):
         outputs = program.add(closed.jaxpr, closed.consts, inputs)
+    program.drop_unused(outputs)
     structure, dtypes = jax.tree.structure(shape), [v.aval.dtype for v in closed.jaxpr.outvars]
 
     def run(*args: Any) -> Any:
@@ -78,6 +79,15 @@ class _Program:
                 found = self._append(_operation(eqn), operands, len(eqn.outvars))
             places.update(zip(eqn.outvars, found, strict=True))
         return [of(atom) for atom in jaxpr.outvars]
+
+    def drop_unused(self, outputs: Sequence[int]) -> None:
+        """Leave operations out whose results nothing needs."""
+        needed, kept = set(outputs), []
+        for operation in reversed(self.operations):
+            if not needed.isdisjoint(operation[2]):
+                needed.update(operation[1])
+                kept.append(operation)
+        self.operations = kept[::-1]
 
     def _append(self, operation: Callable[..., Sequence[Any]], operands: list[int], count: int) -> list[int]:
         known = [self.values[i] for i in operands]
