@@ -1,7 +1,7 @@
 """Linear programs that share a polytope, handed to HiGHS, which begins each one where the last one ended.
 
-A window asks for hundreds of rows: for every state, both sides, and many simulated steps. Their duals differ in goal and
-sides alone, and a few pivots lead from one to the next; a fresh program takes ten times as long.
+A window asks for hundreds of rows: for every state, both sides, and many simulated steps. Their duals differ in goal
+and sides alone, and a few pivots lead from one to the next; a fresh program takes ten times as long.
 """
 
 from __future__ import annotations

@@ -20,6 +20,7 @@ from gsisio_jax.observer.recovery import Recovery
 
 _UP = 1 + 1e-9  # covers float64 sums of nonnegative numbers
 _DETERMINED = 1e-9  # what a row may miss of the entry that it is for, in units of typical widths
+_DUST = 1e-12  # entries of a pseudo-inverse below this share of a row's largest one are what rounding left
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -109,6 +110,8 @@ class Equations:
         """A row m (columns, rows) for every entry of X, and which of them give it."""
         scaled = self.matrix / self.rows[:, None] * self.columns
         inverse = np.where(scaled.any(1), np.linalg.pinv(scaled, rcond=1e-11), 0.0)  # what says nothing counts nothing
+        # Nor does what rounding left: it would ask for entries that nothing determines.
+        inverse[np.abs(inverse) < _DUST * np.abs(inverse).max(1, keepdims=True, initial=0.0)] = 0
         given = np.abs(np.eye(scaled.shape[1]) - inverse @ scaled).max(1, initial=0.0) < _DETERMINED
         return inverse * self.columns[:, None] / self.rows, given
 
