@@ -47,8 +47,15 @@ PLANTS = {
         [[0.8, 0.2, 0], [-0.1, 0.9, 0.3], [0.05, -0.2, 0.7]], np.vstack([np.eye(3), [[1, 1, 0], [0, 1, -1]]]),
         [[0.5, 0, 1], [0, 1, 0], [0, 0, 0.4]], np.vstack([np.eye(3), np.zeros((2, 3))]),
     ),
+    "outputs alone": plant([[1.4, 0.3], [-1.2, -0.2]], [[-0.3, -0.2], [0.6, -1.3]]),  # but for rounding, gains say so
     **{f"random {seed}": random_plant(seed) for seed in range(5)},
+    "one row only": plant(
+        [[0, -1, 0, 0], [0, 0, 0, -1], [0, -0.5, -0.4, 0], [0, 0, 0, 0.95]],
+        [[0, 0, 0, 0.2], [0, -0.4, 0, 0], [-0.5, 0, 1.3, 0]], [[-1.8, 0], [0, 0], [0, 1.5], [0, -0.2]],
+    ),
 }  # fmt: skip
+UNDETERMINED = ("one row only",)  # two of its states: never known from R^n, nor if more than one row is lost
+DETERMINED = tuple(name for name in PLANTS if name not in UNDETERMINED)
 
 
 @cache

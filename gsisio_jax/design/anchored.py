@@ -14,12 +14,15 @@ from gsisio_jax.design.dead_beat import (
     NOTHING,
     affine_problem,
     as_recovery,
+    dead_beat_rows,
     sizes_without_boxes,
     unseen_after,
 )
 from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.window_program import WindowProgram
 from gsisio_jax.design.window_runs import Rows
+from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.recovery import Recovery
 from gsisio_jax.observer.recovery_constants import AffineMaps
@@ -32,7 +35,12 @@ _BOX = 0.5  # half the width of the box before a gap, in units of typical widths
 
 
 def with_anchored_rows(
-    observer: Observer, certificate: Certificate, problem: GainProblem, maps: AffineMaps, width: np.ndarray
+    observer: Observer,
+    certificate: Certificate,
+    problem: GainProblem,
+    maps: AffineMaps,
+    width: np.ndarray,
+    u_region: Interval,
 ) -> tuple[Observer, Certificate]:
     """The observer with rows for every gap after which its boxes are finite later than they could be, if any, and the
     certificate with what they prove.
@@ -43,22 +51,35 @@ def with_anchored_rows(
         problem: of the design.
         maps: affine bounds of f, g and T2 g on the state bounds.
         width: (n,) typical widths of boxes.
+        u_region: known inputs of the design.
     """
     n, system = problem.n, observer.system
-    unknown, said = np.array(certificate.recovery_steps), certificate.lost_row_steps
-    if n > _LONGEST or not unknown.size or not said:
+    if n > _LONGEST or not certificate.recovery_steps or not certificate.lost_row_steps:
         return observer, certificate
+    H_slack = nearest_feedthrough(np.asarray(observer.T2, np.float64), system.H)
+    if not observer.recovery and any(certificate.recovery_steps):
+        # y[k] may determine all states, and no gain say so, as slopes on infinite boxes cancel up to rounding only.
+        rows = [
+            stored_recovery(rows, observer, system, maps, H_slack, np.float64)
+            for rows in dead_beat_rows(problem, maps, width, always=True)
+        ]
+        if alone := tuple(found for found in rows if found is not None):
+            observer = replace(observer, recovery=alone)
+            certificate = with_recovery(observer, width, u_region)
+    unknown, said = np.array(certificate.recovery_steps), certificate.lost_row_steps
     nothing = np.zeros(problem.l, bool)
     affine = affine_problem(problem, maps, nothing, nothing)
     scaled = affine.scaled(width)
-    H_slack = nearest_feedthrough(np.asarray(observer.T2, np.float64), system.H)
     added: list[Recovery] = []
     steps: list[tuple[float, ...]] = []
+    tried = False  # some states would stay infinite for good without these rows; whether they do not is tried
     for lost in range(1, n + 1):
         now = np.array(said[min(lost, len(said)) - 1])
-        first = np.where(np.isfinite(now), np.minimum(now, rows_until_finite(scaled, lost)), now)
-        for after in range(int(np.max(now, where=first < now, initial=0))):
-            states = np.flatnonzero((first <= after) & (after < now))
+        first = np.minimum(now, rows_until_finite(scaled, lost))
+        # Once all boxes are finite that can be, the step keeps them so.
+        until = np.where(np.isfinite(now), now, 1 + np.max(first, where=np.isfinite(first), initial=0))
+        for after in range(int(np.max(until, where=first < now, initial=0))):
+            states = np.flatnonzero((first <= after) & (after < until))
             if not states.size:
                 continue
             rows = _rows(affine, scaled, maps, width, lost, after, states)
@@ -68,18 +89,20 @@ def with_anchored_rows(
                 first[states] = after + 1
             else:
                 added.append(rows)
+                tried |= bool(np.isinf(now[states]).any())
         steps.append(tuple(map(float, first)))
         if (first == unknown).all():
             break  # nor after more rows
     if not added:
         return observer, certificate
+    longer = replace(observer, recovery=(*observer.recovery, *added))
+    if tried:
+        found = with_recovery(longer, width, u_region)
+        return (observer, certificate) if found.lost_row_steps == said else (longer, found)
     if steps[-1] != said[-1]:  # gaps too long for these rows
         steps.append(said[-1])
     recoverable = bool(np.isfinite(steps[0]).all())
-    return (
-        replace(observer, recovery=(*observer.recovery, *added)),
-        replace(certificate, lost_row_steps=tuple(steps), recoverable=recoverable),
-    )
+    return longer, replace(certificate, lost_row_steps=tuple(steps), recoverable=recoverable)
 
 
 def rows_until_finite(problem: GainProblem, lost: int) -> np.ndarray:

@@ -167,7 +167,7 @@ def design_current(
     say("trying what happens after a lost row")
     certificate = with_recovery(observer, width, u_region)
     if maps is not None:
-        observer, certificate = with_anchored_rows(observer, certificate, problem, maps, width)
+        observer, certificate = with_anchored_rows(observer, certificate, problem, maps, width, u_region)
     if certificate.recoverable is False:
         certificate = certificate.with_notes(what_recovers(plan, on, box))
     return replace(observer, certificate=certificate)

@@ -24,6 +24,7 @@ def dead_beat_rows(
     maps: AffineMaps,
     width: np.ndarray,
     lost: tuple[Collection[int], Collection[int]] | None = None,
+    always: bool = False,
 ) -> tuple[Recovery, ...]:
     """One row for every state that measurements determine, over its own shortest window, with no weight on any box of
     an earlier step, of least noise.
@@ -33,13 +34,13 @@ def dead_beat_rows(
         maps: affine bounds of f, g and T2 g on the state bounds; what these leave open counts as noise.
         width: (n,) typical widths of boxes, as units.
         lost: outputs of y[k-1] and of y[k] to do without; then rows look back one step at most.
+        always: also where all of y[k] alone determines all states, as gains say so as well, but for rounding.
 
     Returns:
-        The rows, those of one length together, without what rounding leaves of them (see `recovery_constants`); none
-        where all of y[k] alone determines all states.
+        The rows, those of one length together, without what rounding leaves of them (see `recovery_constants`).
     """
     n, l = problem.n, problem.l
-    if n > _LARGEST or (lost is None and np.linalg.matrix_rank(maps.slope[n + l :]) == n):
+    if n > _LARGEST or (lost is None and not always and np.linalg.matrix_rank(maps.slope[n + l :]) == n):
         return ()
     before, now = (np.isin(np.arange(l), list(outputs)) for outputs in lost or ((), ()))
     affine = affine_problem(problem, maps, before, now)

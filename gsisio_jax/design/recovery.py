@@ -36,7 +36,7 @@ def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_reg
     """
     rows, n = (observer.inner if isinstance(observer, DelayedObserver) else observer).recovery, observer.system.n
     steps, reached = np.full(n, np.inf), np.full(n, np.inf)
-    for group in rows or ():
+    for group in [group for group in rows or () if group.anchor is None]:
         steps[list(group.targets)], reached[list(group.targets)] = group.length, group.width
     bounds = np.asarray(observer.system.state_bounds.width)
     at_once = np.where(steps == 0, np.minimum(reached, bounds), bounds)

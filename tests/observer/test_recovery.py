@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recovery_plants import PLANTS, designed, records, steps_until_determined
+from recovery_plants import DETERMINED, PLANTS, designed, records, steps_until_determined
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
@@ -20,7 +20,7 @@ def finite(box):
     return np.isfinite(np.asarray(box.width)).all(-1)
 
 
-@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("name", DETERMINED)
 def test_boxes_are_finite_again_as_soon_as_the_state_is_determined(name):
     observer, n = designed(name), len(PLANTS[name][0])
     x, y = records(name, 1)
