@@ -36,16 +36,6 @@ def rounded(call: str, observer: AnyObserver, rounding: Rounding | None) -> AnyO
     return observer if observer.rounding == rounding else observer.with_rounding(rounding)
 
 
-def refuse_tolerant(call: str, observer: AnyObserver) -> None:
-    """For calls that hold the boxes of a step against its truth while it runs, and know a single step a row alone."""
-    if isinstance(observer, TolerantObserver):
-        raise ValueError(
-            f"{call}: the observer tolerates wrong outputs ({observer.tolerate} a step), so its box is that of many "
-            "steps. gx.estimate takes it, also over many cases: jax.vmap(lambda noise: gx.estimate(observer, "
-            "initial, y, noise=noise))(noises)"
-        )
-
-
 def refuse_input_model(call: str, system: Any, why: str) -> None:
     """For calls that know nothing of how the unknown input moves."""
     for name in ("input_rate", "input_constant"):

@@ -29,10 +29,14 @@ def scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold
         y_k, u_k, now = row
         return advance(observer, carry, y_k, u_k, noise_of_row(noise, now), hold)
 
-    rows = y, u, noise_rows(noise)
+    return turns(observer, body, carry, (y, u, noise_rows(noise)), y.shape[0])
+
+
+def turns(observer: AnyObserver, body: Callable[..., Any], carry: Any, rows: Any, length: int | None = None) -> Any:
+    """``jax.lax.scan`` of a body with one step of the observer in it, computed as suits that step."""
     if isinstance(observer, TolerantObserver):  # many copies of one step: over arrays
-        return jax.lax.scan(scalar.in_tasks(body), carry, rows, length=y.shape[0])
-    return scalar.scan(body, carry, rows, length=y.shape[0])
+        return jax.lax.scan(scalar.in_tasks(body), jax.tree.map(jnp.asarray, carry), rows, length=length)
+    return scalar.scan(body, carry, rows, length=length)
 
 
 def blank(observer: AnyObserver, initial: Interval) -> Carry:

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax import scalar
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.fixed import Fixed
+from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.plant.periodic import nearest
 from gsisio_jax.scalar.options import loop_bytes
 from gsisio_jax.study import later
@@ -123,7 +123,7 @@ def _case(
     running = [None if isinstance(r, Kept) else state for r, state in zip(reductions, states, strict=True)]
     given = later.longer(source, case, delay) if delay else source.given(case)
     steps = jnp.arange(1, source.steps(case) + delay, dtype=jnp.int32), given
-    (_, carried, running, _), kept = scalar.scan(body, (carry, carried, running, truth), steps)
+    (_, carried, running, _), kept = scan.turns(observer, body, (carry, carried, running, truth), steps)
     results: dict[str, Any] = {}
     for reduction, start, state, rest in zip(reductions, states, running, kept, strict=True):
         if isinstance(reduction, Kept):
@@ -264,10 +264,12 @@ def fingerprint(
     system = observer.system
     maps = jax.make_jaxpr(system.maps)(np.zeros(system.n), np.zeros(system.m))
     names = [repr(r) if is_dataclass(r) else f"{type(r).__qualname__} {r.name}" for r in reductions]
-    inner = observer.inner if isinstance(observer, DelayedObserver) else observer
+    inner = observer.inner if isinstance(observer, DelayedObserver | TolerantObserver) else observer
     static = [getattr(inner, name, None) for name in ("bounds", "sweeps", "output_rows", "framer", "rounding")]
     if isinstance(observer, DelayedObserver):
         static.append((observer.delay, observer.lift.more))
+    if isinstance(observer, TolerantObserver):
+        static.append(f"tolerates {observer.tolerate}")
     if system.periodic or system.periodic_states:
         static.append((system.periodic, system.periodic_states))
     text, constants = source.identity(observer)

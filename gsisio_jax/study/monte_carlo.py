@@ -116,7 +116,6 @@ def monte_carlo(
     """
     need("xarray", extra="study", purpose="a Monte Carlo study")
     observer = checks.rounded(CALL, observer, rounding)
-    checks.refuse_tolerant(CALL, observer)
     checks.refuse_input_model(
         CALL, observer.system, "and drawn inputs are not held against it; simulate inputs that keep to it with "
         "gx.simulate, and use gx.estimate or gx.sweep"

@@ -12,6 +12,7 @@ import numpy as np
 
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import scan
+from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.plant.simulation import measured, moved
 from gsisio_jax.study import containment
 from gsisio_jax.study.containment import BROKEN
@@ -108,7 +109,7 @@ class Simulated(Rows):
             d = jnp.zeros(system.p, x.dtype)
         if callable(self.draw):
             w, v = (jnp.asarray(part, x.dtype) for part in self.draw(key_noise, k, x, noise))
-            legal = noise.w.contains(w).all() & noise.v.contains(v).all()
+            legal = noise.w.contains(w).all() & ((~noise.v.contains(v)).sum() <= tolerated(observer))
         else:
             key_w, key_v = jax.random.split(key_noise)
             w, v = (_inside(key, box, self.draw == "vertices") for key, box in ((key_w, noise.w), (key_v, noise.v)))
@@ -116,6 +117,11 @@ class Simulated(Rows):
         outside = jnp.where(system.input_bounds.contains(d).all(), 0, 4) | jnp.where(legal, 0, 8)
         y, _ = measured(system, x, d, u, v, noise.v)
         return Row(y, u, noise, x, before), (x, d, u, w, noise.w), outside
+
+
+def tolerated(observer: Any) -> int:
+    """Outputs of a step that may be wrong."""
+    return observer.tolerate if isinstance(observer, TolerantObserver) else 0
 
 
 def _row(case: Any, k: int) -> Any:

@@ -97,7 +97,6 @@ def sweep(
     """
     need("xarray", extra="study", purpose="a sweep")
     observer = checks.rounded(CALL, observer, rounding)
-    checks.refuse_tolerant(CALL, observer)
     reductions = resolve(CALL, reduce, truth is not None)
     hold = checks.check_on_conflict(CALL, on_conflict)
     given = {

@@ -3,6 +3,7 @@
 from itertools import product
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import linprog
@@ -191,6 +192,30 @@ def test_what_cannot_be_tolerated_says_so():
             gx.design_observer(plant, bounds, region, **options)
 
 
-def test_studies_refuse_it_with_the_remedy(observers):
-    with pytest.raises(ValueError, match=r"tolerates wrong outputs \(1 a step\).*jax\.vmap"):
-        gx.study.monte_carlo(observers[0], jax.random.key(0), 2, INITIAL, np.zeros((3, 1)))
+def test_studies_take_it():
+    """A sweep is its estimates. In simulated runs one gross fault a step is what was promised, two are more."""
+    system = gx.System(lambda x: 0.9 * x, lambda x: jnp.stack([x[0], x[0]]), G=np.zeros((1, 0)), H=np.zeros((2, 0)))
+    noise = gx.Noise(Interval.symmetric([0.02]), Interval.symmetric([0.1, 0.1]))
+    observer = gx.design_observer(system, noise, Interval.symmetric([5.0]), tolerate=1)
+    initial, twice, rng = Interval.symmetric([2.0]), 6, np.random.default_rng(4)
+    x = rng.uniform(-2, 2, (20, 1, 1)) * 0.9 ** np.arange(ROWS)[:, None]
+    y = x + rng.uniform(-0.1, 0.1, (20, ROWS, 2))
+    y[:, ::2, 0] += 30
+    est = jax.jit(jax.vmap(lambda y: gx.estimate(observer, initial, y)))(y)
+    found = gx.study.sweep(
+        observer, initial, gx.grid("run", y), truth=gx.grid("run", (x, None)), reduce=("max", "coverage")
+    )
+    np.testing.assert_allclose(found.state_width_max, np.asarray(est.state.width).max(1), rtol=1e-12)
+    assert (found.state_coverage == 1).all()
+
+    def draw(key, k, x, noise):
+        w, v = (
+            jax.random.uniform(one, box.shape, minval=box.lower, maxval=box.upper)
+            for one, box in zip(jax.random.split(key), (noise.w, noise.v), strict=True)
+        )
+        return w, v + 20 * (jax.random.permutation(key, 2) < jnp.where(k == twice, 2, k > 1))
+
+    runs = gx.study.monte_carlo(observer, 0, 20, ROWS, initial, draw=draw, on_miss="record", reduce="final")
+    assert (runs.broken_at == twice).all()
+    assert (runs.broken == 8).all()
+    assert (runs.first_miss.isnull() | (runs.first_miss >= twice)).all()
