@@ -85,6 +85,8 @@ def summary(est: Estimate, observer: Any = None, u: Any = None) -> str:
         ("unbounded", f"{_count(status, Status.UNBOUNDED)} steps with a state that is not bounded"),
         ("no promise", str(where(est, observer, u))),
     ]
+    if est.kept is not None:
+        facts.insert(-1, ("outvoted", f"{_count(status, Status.OUTVOTED)} steps with an output that is not kept"))
     if observer is not None and not observer.certificate.self_consistent:
         kind = "empty" if observer.certificate.certified else "none"
         facts[-1] = ("no promise", f"at all: the certificate is {kind}; print(observer.certificate) says why")

@@ -14,6 +14,7 @@ from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.enclosures import slopes_of
 from gsisio_jax.observer.estimation import estimate
 from gsisio_jax.observer.prediction_step import PredictionObserver
+from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.plant.system import Noise, System
 from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.study.stretch import Affine, Sides, Stretch
@@ -57,7 +58,8 @@ def tightness(
         `Tightness`. Rows in which nothing agrees with the record (a conflict) are NaN.
 
     Raises:
-        ValueError: as `estimate`; a step is not in the record, the horizon is below 1, or the system is periodic.
+        ValueError: as `estimate`; a step is not in the record, the horizon is below 1, the system is periodic, or the
+            observer tolerates wrong outputs.
         RuntimeError: HiGHS fails on a program.
 
     >>> import gsisio_jax as gx
@@ -80,6 +82,11 @@ def tightness(
         raise ValueError(
             f"{call}: the system is periodic, so what agrees with the record is no convex set; unwrap the outputs "
             "(numpy.unwrap) and leave `periodic` and `periodic_states` out of the System"
+        )
+    if isinstance(observer, TolerantObserver):
+        raise ValueError(
+            f"{call}: `observer` tolerates wrong outputs ({observer.tolerate} a step), and the exact hull believes every "
+            "output; give one of a design with tolerate=0, and a record without faults"
         )
     refuse_input_model(call, system, "which the exact hull does not know, so boxes may be smaller; leave it out")
     chosen = _chosen(steps, len(u_ready))

@@ -113,6 +113,11 @@ def allocate(
         raise ValueError(
             f"allocate: `required` must hold {system.n} positive widths, inf where none is required, got {required}"
         )
+    if design.get("tolerate"):
+        raise ValueError(
+            f"allocate: `tolerate` must be 0, got {design['tolerate']!r}: no width is promised while outputs may be wrong; "
+            "buy bounds without it, and design with it afterwards"
+        )
     market = _Market(system, noise, region, required, price, limits, u_region)
     best, history = market.search()
     for _ in range(_MOST_DESIGNS):

@@ -117,7 +117,7 @@ def _check(observer: Any, records: Any, objective: str, method: str, tolerance: 
     if not isinstance(observer, Observer):
         raise ValueError(
             "tune_noise: `observer` must be of the current form, from `design_observer(..., form='current')` without "
-            "a delay, got "
+            "`delay` and `tolerate`, got "
             f"{type(observer).__name__}"
         )
     if not isinstance(records, Records):

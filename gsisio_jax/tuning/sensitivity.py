@@ -68,7 +68,7 @@ def width_sensitivity(
     xarray = need("xarray", extra="tune", purpose="a labelled table")
     if not isinstance(observer, Observer):
         raise ValueError(
-            "width_sensitivity: an observer of the current form without a delay is needed, got "
+            "width_sensitivity: an observer of the current form without `delay` and `tolerate` is needed, got "
             f"{type(observer).__name__}"
         )
     if (model is None) != (theta is None):

@@ -192,6 +192,24 @@ def test_what_cannot_be_tolerated_says_so():
             gx.design_observer(plant, bounds, region, **options)
 
 
+def test_what_believes_every_output_refuses_it(observers):
+    y, noise = np.zeros((4, 3)), observers[0].noise
+    system = gx.System(lambda x: TURN @ x, lambda x: C @ x, G=G, H=np.zeros((3, 1)), input_constant=2)
+    with pytest.raises(ValueError, match=r"tightness: `observer` tolerates .* believes every output; .* tolerate=0"):
+        gx.tightness(observers[0], INITIAL, y)
+    with pytest.raises(ValueError, match="width_sensitivity: .* without `delay` and `tolerate`"):
+        gx.width_sensitivity(observers[0], INITIAL, y)
+    with pytest.raises(ValueError, match="tune_noise: .* without `delay` and `tolerate`, got TolerantObserver"):
+        gx.tune_noise(observers[0], None)
+    with pytest.raises(ValueError, match=r"design_observer: .*`input_constant`, .*; leave it out, or tolerate nothing"):
+        gx.design_observer(system, noise, INITIAL, tolerate=1)
+    turning = gx.System(lambda x: TURN @ x, lambda x: C @ x, G=G, H=np.zeros((3, 1)), periodic={0: 6.0})
+    with pytest.raises(ValueError, match=r"with `tolerate`, no output or state may be periodic; unwrap the outputs"):
+        gx.design_observer(turning, noise, INITIAL, tolerate=1)
+    with pytest.raises(ValueError, match=r"allocate: .*`tolerate`"):
+        gx.allocate(observers[0].system, noise, INITIAL, [1.0, 1.0], {"v": np.ones(3)}, tolerate=1)
+
+
 def test_studies_take_it():
     """A sweep is its estimates. In simulated runs one gross fault a step is what was promised, two are more."""
     system = gx.System(lambda x: 0.9 * x, lambda x: jnp.stack([x[0], x[0]]), G=np.zeros((1, 0)), H=np.zeros((2, 0)))
