@@ -85,8 +85,8 @@ def tightness(
         )
     if isinstance(observer, TolerantObserver):
         raise ValueError(
-            f"{call}: `observer` tolerates wrong outputs ({observer.tolerate} a step), and the exact hull believes every "
-            "output; give one of a design with tolerate=0, and a record without faults"
+            f"{call}: `observer` tolerates wrong outputs ({observer.tolerate} a step), and the exact hull believes "
+            "every output; give one of a design with tolerate=0, and a record without faults"
         )
     refuse_input_model(call, system, "which the exact hull does not know, so boxes may be smaller; leave it out")
     chosen = _chosen(steps, len(u_ready))

@@ -115,8 +115,8 @@ def allocate(
         )
     if design.get("tolerate"):
         raise ValueError(
-            f"allocate: `tolerate` must be 0, got {design['tolerate']!r}: no width is promised while outputs may be wrong; "
-            "buy bounds without it, and design with it afterwards"
+            f"allocate: `tolerate` must be 0, got {design['tolerate']!r}: no width is promised while outputs may be "
+            "wrong; buy bounds without it, and design with it afterwards"
         )
     market = _Market(system, noise, region, required, price, limits, u_region)
     best, history = market.search()

@@ -197,9 +197,9 @@ def test_what_believes_every_output_refuses_it(observers):
     system = gx.System(lambda x: TURN @ x, lambda x: C @ x, G=G, H=np.zeros((3, 1)), input_constant=2)
     with pytest.raises(ValueError, match=r"tightness: `observer` tolerates .* believes every output; .* tolerate=0"):
         gx.tightness(observers[0], INITIAL, y)
-    with pytest.raises(ValueError, match="width_sensitivity: .* without `delay` and `tolerate`"):
+    with pytest.raises(ValueError, match=r"width_sensitivity: .* without `delay` and `tolerate`"):
         gx.width_sensitivity(observers[0], INITIAL, y)
-    with pytest.raises(ValueError, match="tune_noise: .* without `delay` and `tolerate`, got TolerantObserver"):
+    with pytest.raises(ValueError, match=r"tune_noise: .* without `delay` and `tolerate`, got TolerantObserver"):
         gx.tune_noise(observers[0], None)
     with pytest.raises(ValueError, match=r"design_observer: .*`input_constant`, .*; leave it out, or tolerate nothing"):
         gx.design_observer(system, noise, INITIAL, tolerate=1)
