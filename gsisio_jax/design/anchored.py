@@ -72,9 +72,10 @@ def with_anchored_rows(
     scaled = affine.scaled(width)
     added: list[Recovery] = []
     steps: list[tuple[float, ...]] = []
+    widths: list[np.ndarray] = []
     tried = False  # some states would stay infinite for good without these rows; whether they do not is tried
     for lost in range(1, n + 1):
-        now = np.array(said[min(lost, len(said)) - 1])
+        now, width_now = certificate.rows_until_finite(lost), certificate.recovered_width(lost)
         first = np.minimum(now, rows_until_finite(scaled, lost))
         # Once all boxes are finite that can be, the step keeps them so.
         until = np.where(np.isfinite(now), now, 1 + np.max(first, where=np.isfinite(first), initial=0))
@@ -89,9 +90,12 @@ def with_anchored_rows(
                 first[states] = after + 1
             else:
                 added.append(rows)
+                begin = np.array([first[i] == after for i in rows.targets])
+                width_now[np.array(rows.targets)[begin]] = rows.width[begin]
                 tried |= bool(np.isinf(now[states]).any())
         steps.append(tuple(map(float, first)))
-        if (first == unknown).all():
+        widths.append(width_now)
+        if (first == unknown).all() and lost >= len(said):
             break  # nor after more rows
     if not added:
         return observer, certificate
@@ -101,8 +105,11 @@ def with_anchored_rows(
         return (observer, certificate) if found.lost_row_steps == said else (longer, found)
     if steps[-1] != said[-1]:  # gaps too long for these rows
         steps.append(said[-1])
+        widths.append(certificate.recovered_width(len(steps)))
     recoverable = bool(np.isfinite(steps[0]).all())
-    return longer, replace(certificate, lost_row_steps=tuple(steps), recoverable=recoverable)
+    return longer, replace(
+        certificate, lost_row_steps=tuple(steps), lost_row_width=np.array(widths), recoverable=recoverable
+    )
 
 
 def rows_until_finite(problem: GainProblem, lost: int) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from gsisio_jax.design.gain_selection import main_gain, profile_of, with_rows
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window_program import rows_of_gains
-from gsisio_jax.design.window_runs import Runs
+from gsisio_jax.design.window_runs import Rows, Runs
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
 
@@ -40,7 +40,19 @@ def gains_without_outputs(problem: GainProblem, bank: list[np.ndarray], region: 
         return []
     main = bank[0]
     width = profile_of(problem, problem.steady_width(main), region)
-    now = _widths(problem, bank, width)
+    scaled = problem.scaled(width)
+    known = rows_of_gains(scaled, [problem.scaled_gain(N, width) for N in bank], 1)
+
+    def reached_with(gains: list[np.ndarray]) -> np.ndarray:
+        """Mean logarithm (n,) of the widths of simulated runs with the bank and these gains, in units of `width`."""
+        rows = Rows([*known.parts], [*known.states])
+        more = rows_of_gains(scaled, [problem.scaled_gain(N, width) for N in gains], 1)
+        for state, parts in zip(more.states, more.parts, strict=True):
+            rows.add(state, parts)
+        runs = Runs(scaled, 1, np.full(problem.n, 1.5), np.random.default_rng(0)).of(rows, False)
+        return np.mean([np.log(np.maximum(below + above, 1e-12)) for _, _, below, above in runs], (0, 1))
+
+    now = reached_with([])
     rows: list[list[np.ndarray]] = [[] for _ in range(problem.n)]
     for j in range(l):
         gain = _without(problem, j, region)
@@ -48,19 +60,11 @@ def gains_without_outputs(problem: GainProblem, bank: list[np.ndarray], region: 
             continue
         for i in range(problem.n):
             tried = np.where((np.arange(problem.n) == i)[:, None], gain, main)
-            reached = _widths(problem, [*bank, *with_rows(main, rows), tried], width)
+            reached = reached_with([*with_rows(main, rows), tried])
             if reached[i] < now[i] - _LEAST_GAIN:
                 rows[i].append(gain[i])
                 now = reached
     return with_rows(main, rows)
-
-
-def _widths(problem: GainProblem, bank: list[np.ndarray], width: np.ndarray) -> np.ndarray:
-    """Mean logarithm (n,) of the widths of simulated runs with these gains, in units of `width`."""
-    scaled = problem.scaled(width)
-    rows = rows_of_gains(scaled, [problem.scaled_gain(N, width) for N in bank], 1)
-    runs = Runs(scaled, 1, np.full(problem.n, 1.5), np.random.default_rng(0)).of(rows, False)
-    return np.mean([np.log(np.maximum(below + above, 1e-12)) for _, _, below, above in runs], (0, 1))
 
 
 def reduced(problem: GainProblem, j: int) -> tuple[GainProblem, np.ndarray]:

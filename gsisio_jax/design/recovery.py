@@ -24,10 +24,11 @@ from gsisio_jax.plant.system import Noise
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 _MOST_STATES = 12  # beyond, a trial takes seconds, and is left out where rows prove as much
+_LISTED = 3  # so many lost rows at least, if they are no more than states: boxes are as wide as the gap is long
 
 
 def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_region: Interval) -> Certificate:
-    """The certificate, with `recoverable`, `recovery_steps`, `recovery_width` and `lost_row_steps`.
+    """The certificate, with `recoverable`, `recovery_steps`, `recovery_width`, `lost_row_steps` and `lost_row_width`.
 
     Args:
         observer: a finished observer.
@@ -48,28 +49,32 @@ def with_recovery(observer: Observer | DelayedObserver, width: np.ndarray, u_reg
         return replace(
             observer.certificate, recoverable=proved, lost_row_steps=lost,
             recovery_steps=_plain(steps) if proved else (), recovery_width=reached if proved else None,
+            lost_row_width=reached[None] if proved else None,
         )  # fmt: skip
     if not proved:
-        widths = trial.widths(observer.system.state_bounds, trial.rows)
-        steps, reached = _rows_until_finite(widths), widths[-1]
+        steps, reached = _first_finite(trial.widths(observer.system.state_bounds, trial.rows))
     around = Interval.unchecked(trial.start - width / 2, trial.start + width / 2)
     found: list[tuple[float, ...]] = []
-    # Rows that need no box make every box finite for good.
-    for widths in trial.after_gaps(around, int(steps.max()) + 1 if proved else None):
-        found.append(_plain(_rows_until_finite(widths)))
-        if found[-1] == _plain(steps):
+    then: list[np.ndarray] = []
+    # After a gap no box comes back later than from any state, and then stays finite.
+    for widths in trial.after_gaps(around, int(steps.max()) + 1 if np.isfinite(steps).all() else None):
+        now, size = _first_finite(widths)
+        found.append(_plain(now))
+        then.append(size)
+        if found[-1] == _plain(steps) and len(found) >= _LISTED:
             break  # more rows cannot take more than all that was known
     return replace(
         observer.certificate, recoverable=bool(np.isfinite(found[0]).all()), recovery_steps=_plain(steps),
-        recovery_width=reached, lost_row_steps=tuple(found),
+        recovery_width=reached, lost_row_steps=tuple(found), lost_row_width=np.array(then),
     )  # fmt: skip
 
 
-def _rows_until_finite(widths: np.ndarray) -> np.ndarray:
-    """After how many of these rows (T, n) a box is finite and stays so, (n,); ``inf`` where the last one is not."""
+def _first_finite(widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """After how many of these rows (T, n) a box is finite and stays so, (n,), and how wide it is there; ``inf`` where
+    the last one is infinite."""
     infinite = np.isinf(widths)
     count = np.where(infinite.any(0), len(widths) - np.argmax(infinite[::-1], 0), 0)
-    return np.where(infinite[-1], np.inf, count)
+    return np.where(infinite[-1], np.inf, count), widths[count.clip(max=len(widths) - 1), np.arange(widths.shape[1])]
 
 
 def _plain(steps: np.ndarray) -> tuple[float, ...]:

@@ -26,7 +26,8 @@ class Rows:
     def add(self, state: int, parts: np.ndarray) -> None:
         """Unless it is there."""
         own = np.array([old for old, of in zip(self.parts, self.states, strict=True) if of == state])
-        if not np.isclose(parts, own.reshape(-1, len(parts)), atol=1e-7).all(1).any():
+        own = own.reshape(-1, len(parts))
+        if not (np.abs(parts - own) <= 1e-7 + 1e-5 * np.abs(own)).all(1).any():
             self.parts.append(parts)
             self.states.append(state)
 

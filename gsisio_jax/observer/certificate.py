@@ -37,11 +37,12 @@ class Certificate(eqx.Module):
             of the state before (a start from R^n, any gap, a conflict); ``inf``: not within n + 4 rows; () where it was
             not examined. Proved where f and g have affine bounds, else tried without noise from the centre of the
             region.
-        recovery_width: (n,) bound of the width of the box then, at the noise of the design (where it was tried: the
-            width at the end of the trial).
+        recovery_width: (n,) bound of the width of the box in that row, at the noise of the design; where f and g are
+            not affine and no row proves it, what the trial shows.
         lost_row_steps: the same after 1, 2, ... lost rows between boxes that were finite; more rows than listed take
             what the last entry says. Tried, or proved by rows that lean on the box before the gap; where f and g are
             affine the trial is the rule.
+        lost_row_width: (m, n), how wide boxes are in these rows: `recovered_width`.
         window: what rows over several steps make of widths (`WindowWidths`), where f and g are affine; else None.
         rounds: how often the certified bound is applied in a step, about the middle of what it has left (theory 5.6).
         excess: (n,), width that they leave of boxes as wide as the region.
@@ -74,6 +75,7 @@ class Certificate(eqx.Module):
     recovery_steps: tuple[float, ...] = eqx.field(static=True, default=())
     recovery_width: Any = None
     lost_row_steps: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())
+    lost_row_width: Any = None
     window: Any = None
     slices: Any = None
     input_noise_w: Any = None  # (p, n), weight of w in input boxes beside that of `input_state_now`; None: nothing
@@ -198,17 +200,42 @@ class Certificate(eqx.Module):
         Raises:
             ValueError: `lost` is no such number, or recovery was not examined (``missing=False`` in the design).
         """
-        if lost is not None and (not is_whole(lost) or lost < 1):
-            raise ValueError(
-                f"rows_until_finite: `lost` must be a number of rows, at least 1, or None (any state), got {lost!r}"
-            )
         found = (self.recovery_steps,) if lost is None else self.lost_row_steps
-        if not found or not found[0]:
+        self._check_lost("rows_until_finite", lost, found)
+        return np.array(found[-1 if lost is None else min(lost, len(found)) - 1])
+
+    def recovered_width(self, lost: int | None = None) -> np.ndarray:
+        """Bound of the width of the box of each state in the row that `rows_until_finite` says, (n,), units of the
+        states, at the noise of the design; ``inf``: never finite, or the gap is longer than was examined.
+
+        After lost rows it is that for boxes which had settled before (no wider than `steady_width`; where that is
+        infinite, than the region or than what outputs resolve). Where f and g are not affine, it is what a trial shows.
+
+        Args:
+            lost: as in `rows_until_finite`.
+
+        Raises:
+            ValueError: as `rows_until_finite`.
+
+        Source: theory 5.8.
+        """
+        steps = (self.recovery_steps,) if lost is None else self.lost_row_steps
+        self._check_lost("recovered_width", lost, steps)
+        if lost is None:
+            return np.array(self.recovery_width)
+        if lost <= len(steps):
+            return np.array(self.lost_row_width[lost - 1])
+        # What comes back no sooner than from any state is no wider then.
+        return np.where(np.equal(steps[-1], self.recovery_steps), self.recovery_width, np.inf)
+
+    def _check_lost(self, call: str, lost: Any, steps: tuple[Any, ...]) -> None:
+        if lost is not None and (not is_whole(lost) or lost < 1):
+            raise ValueError(f"{call}: `lost` must be a number of rows, at least 1, or None (any state), got {lost!r}")
+        if not steps or not steps[0]:
             raise ValueError(
-                "rows_until_finite: the certificate must be that of a design with missing=True in the current form, "
+                f"{call}: the certificate must be that of a design with missing=True in the current form, "
                 "whose nominal trajectory stays where f and g have numbers; this one has nothing on recovery"
             )
-        return np.array(found[-1 if lost is None else min(lost, len(found)) - 1])
 
     def __str__(self) -> str:
         lines = [self._headline()]
@@ -230,16 +257,20 @@ class Certificate(eqx.Module):
         return "\n".join(lines)
 
     def _recovery(self) -> list[str]:
-        """From which row on a box is finite, by what was before."""
-        columns, most = {"1 lost row": self.lost_row_steps[0]}, len(self.lost_row_steps)
+        """From which row on a box is finite, by what was before, and how wide it is then."""
+        most = len(self.lost_row_steps)
+        columns = {"1 lost row": self.lost_row_steps[0], "width then": self.recovered_width(1)}
         if self.lost_row_steps[-1] != self.lost_row_steps[0]:
             columns[f"{most}+ lost rows"] = self.lost_row_steps[-1]
-        columns["any state"] = self.recovery_steps
+        columns |= {"any state": self.recovery_steps, "its width": self.recovered_width()}
         lines = ["  boxes are finite from the row (0: the first measured one) after"]
-        lines.append("  " + " " * 10 + "".join(f"{name:>14}" for name in (*columns, "width then")))
-        for i, width in enumerate(np.asarray(self.recovery_width)):
-            steps = ("never" if np.isinf(column[i]) else f"{column[i]:.0f}" for column in columns.values())
-            lines.append(f"  state {i + 1:<4}" + "".join(f"{text:>14}" for text in (*steps, f"{width:.6g}")))
+        lines.append("  " + " " * 10 + "".join(f"{name:>14}" for name in columns))
+        for i in range(len(self.recovery_steps)):
+            cells = (
+                f"{column[i]:.6g}" if "width" in name else "never" if np.isinf(column[i]) else f"{column[i]:.0f}"
+                for name, column in columns.items()
+            )
+            lines.append(f"  state {i + 1:<4}" + "".join(f"{text:>14}" for text in cells))
         return lines
 
     def _headline(self) -> str:

@@ -63,6 +63,9 @@ def test_boxes_are_finite_again_as_soon_as_the_state_is_determined(name):
     if N:  # what the certificate says of the first finite box
         first = width[2][steps.astype(int), np.arange(n)]
         assert (first <= np.asarray(observer.certificate.recovery_width) * (1 + 1e-6)).all()
+    for lost in (1, 2, 3):
+        row = FAULT + lost + observer.certificate.rows_until_finite(lost).astype(int)
+        assert (width[2 + lost, row, np.arange(n)] <= observer.certificate.recovered_width(lost) * (1 + 1e-6)).all()
     for lost in (1, 2, 3):  # and no later than the exact program after a gap, see test_recovery_certificate.py
         after = np.isinf(width[2 + lost, FAULT + lost :])
         np.testing.assert_array_equal(

@@ -21,7 +21,9 @@ def exact_width(name, rows, state, start=np.inf):
     equal += [
         C @ x[k * n :][:n] + H @ d[k * p :][:p] + noise[k * l :][:l] for k, measured in enumerate(rows) if measured
     ]
-    sides = np.concatenate([np.full(n, start), np.full((T - 1) * n + T * p, np.inf), np.tile(v, T), np.tile(w, T - 1)])
+    sides = np.concatenate(
+        [np.broadcast_to(start, n), np.full((T - 1) * n + T * p, np.inf), np.tile(v, T), np.tile(w, T - 1)]
+    )
     equal = np.vstack(equal) if equal else np.zeros((0, size))
     found = linprog(
         -x[(T - 1) * n + state], A_eq=equal, b_eq=np.zeros(len(equal)), bounds=np.stack([-sides, sides], 1),
@@ -53,10 +55,20 @@ def test_every_state_is_known_when_the_exact_program_says_so(name):
         np.testing.assert_allclose(certificate.recovery_width, exact, rtol=1e-5)
     else:
         assert (np.asarray(certificate.recovery_width) <= exact * (1 + 1e-5)).all()
+    settled = np.asarray(certificate.steady_width) / 2
     for lost in (1, 2, 3, len(steps) + 1):
         said, possible = certificate.rows_until_finite(lost), first_finite(name, lost, rows, 2.0)[0]
         np.testing.assert_array_equal(said, possible)
         assert (said <= steps).all()
+        # Settled boxes, the gap, and rows up to that one: no box of all this can be narrower than the exact program.
+        then = certificate.recovered_width(lost)
+        exact = np.array([
+            exact_width(name, [True] + [False] * lost + [True] * int(row + 1), i, settled) if row < np.inf else np.inf
+            for i, row in enumerate(said)
+        ])  # fmt: skip
+        assert (then >= exact * (1 - 1e-6)).all()
+        if lost == 1:
+            assert (then[said < np.inf] <= 1.7 * exact[said < np.inf]).all()
 
 
 def test_a_state_that_only_a_box_before_the_gap_bounds_comes_back():
@@ -79,10 +91,11 @@ def test_states_that_nothing_shows_are_named():
     certificate = gx.design_observer(system, noise, gx.Interval.symmetric([2.0, 2.0])).certificate
     np.testing.assert_array_equal(certificate.rows_until_finite(), [0, np.inf])
     np.testing.assert_array_equal(certificate.rows_until_finite(lost=3), [0, 0])  # its box was finite, and stays so
-    assert "state 2                0         never" in str(certificate)
+    assert "state 2                0             2         never           inf" in str(certificate)
     for wrong in (0, 1.5, True):
-        with pytest.raises(ValueError, match="rows_until_finite: `lost` must be a number of rows, at least 1"):
-            certificate.rows_until_finite(wrong)
+        for call in (certificate.rows_until_finite, certificate.recovered_width):
+            with pytest.raises(ValueError, match=rf"{call.__name__}: `lost` must be a number of rows, at least 1"):
+                call(wrong)
     without = gx.design_observer(system, noise, gx.Interval.symmetric([2.0, 2.0]), missing=False).certificate
     with pytest.raises(ValueError, match="must be that of a design with missing=True"):
         without.rows_until_finite()
