@@ -267,7 +267,7 @@ class Certificate(eqx.Module):
         lines.append("  " + " " * 10 + "".join(f"{name:>14}" for name in columns))
         for i in range(len(self.recovery_steps)):
             cells = (
-                f"{column[i]:.6g}" if "width" in name else "never" if np.isinf(column[i]) else f"{column[i]:.0f}"
+                f"{column[i]:.4g}" if "width" in name else "never" if np.isinf(column[i]) else f"{column[i]:.0f}"
                 for name, column in columns.items()
             )
             lines.append(f"  state {i + 1:<4}" + "".join(f"{text:>14}" for text in cells))
