@@ -23,7 +23,7 @@ def _fresh(code: str) -> str:
 
 
 def test_import_leaves_the_heavy_packages_alone():
-    heavy = ("cvxpy", "clarabel", "pandas", "xarray", "matplotlib", "pydantic", "rich", "gsisio_jax.design")
+    heavy = ("cvxpy", "clarabel", "highspy", "pandas", "xarray", "matplotlib", "pydantic", "rich", "gsisio_jax.design")
     loaded = _fresh(f"import sys, gsisio_jax; print([name for name in {heavy!r} if name in sys.modules])")
     assert loaded == "[]"
 
@@ -54,7 +54,7 @@ def test_online_modules_never_import_the_design(path):
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         else:
             continue
-        assert not [n for n in names if n.startswith(("gsisio_jax.design", "cvxpy", "clarabel", "scipy"))]
+        assert not [n for n in names if n.startswith(("gsisio_jax.design", "cvxpy", "clarabel", "highspy", "scipy"))]
 
 
 def test_a_run_needs_no_solver():
