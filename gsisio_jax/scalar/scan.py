@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from gsisio_jax._collector import rare_collection
 from gsisio_jax.scalar.options import XLA_LOOP_BYTES, loop_bytes
 from gsisio_jax.scalar.primitive import run
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
@@ -124,6 +125,7 @@ def call(function: Callable[..., Any], *args: Any) -> Any:
     return jax.tree.unflatten(structure, _packed(run(program, [*consts, *numbers]), program.results, ()))
 
 
+@rare_collection()
 def _trace(
     function: Callable[..., Any], *args: Any, most: int | None = None
 ) -> tuple[ScalarProgram, list[Any], Any] | None:
