@@ -32,11 +32,19 @@ def scan(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold
     return turns(observer, body, carry, (y, u, noise_rows(noise)), y.shape[0])
 
 
-def turns(observer: AnyObserver, body: Callable[..., Any], carry: Any, rows: Any, length: int | None = None) -> Any:
-    """``jax.lax.scan`` of a body with one step of the observer in it, computed as suits that step."""
+def turns(
+    observer: AnyObserver,
+    body: Callable[..., Any],
+    carry: Any,
+    rows: Any,
+    length: int | None = None,
+    most: int | None = None,
+) -> Any:
+    """``jax.lax.scan`` of a body with one step of the observer in it, computed as suits that step; `most` as in
+    `scalar.scan`."""
     if isinstance(observer, TolerantObserver):  # many copies of one step: over arrays
         return jax.lax.scan(scalar.in_tasks(body), jax.tree.map(jnp.asarray, carry), rows, length=length)
-    return scalar.scan(body, carry, rows, length=length)
+    return scalar.scan(body, carry, rows, length=length, most=most)
 
 
 def blank(observer: AnyObserver, initial: Interval) -> Carry:
