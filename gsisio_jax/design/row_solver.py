@@ -32,8 +32,8 @@ class RowSolver:
     """
 
     def __init__(self, parts: np.ndarray, equal: np.ndarray):
-        matrix = sparse.csc_array(np.vstack([parts, equal]).T)
-        count, columns = matrix.shape
+        stacked = np.vstack([parts, equal]).T
+        (count, columns), matrix = stacked.shape, sparse.csc_array(stacked)
         program = highspy.HighsLp()
         program.num_col_, program.num_row_ = columns, count
         program.col_cost_ = np.zeros(columns)

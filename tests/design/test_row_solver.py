@@ -1,4 +1,4 @@
-"""Rows of windows are dual solutions that HiGHS finds one from the other: each against its own program, primal, cold."""
+"""Rows of windows are dual solutions that HiGHS finds one from the other: each against its own cold primal program."""
 
 import numpy as np
 import pytest
