@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks import soak
+from benchmarks import gallery, soak
 from benchmarks.__main__ import RESULTS, ROOT
 from benchmarks.record import line, title
 
@@ -69,30 +69,9 @@ def limit(found: dict[str, Any]) -> str:
     return "\n".join([*lines, "", _measured(found)])
 
 
-def throughput(found: dict[str, Any]) -> str:
-    """Rates of the whole program, and of the same in NumPy."""
-    slow = found["results"]["throughput NumPy"]["rate"]
-    lines = [title(["", "boxes x steps", "M box-steps/s", "/ NumPy", "compile s", "peak MiB"])]
-    for name, case in found["results"].items():
-        compiled = ["", ""]
-        if "compile_seconds" in case:
-            compiled = [f"{case['compile_seconds']:.1f}", f"{case['peak_mebibytes']:,.0f}"]
-        size = f"{case['batch']:,} x {case['steps']}"
-        cells = f"{case['rate'] / 1e6:.3g}", _two(case["rate"] / slow), *compiled
-        lines.append(line([name.removeprefix("throughput "), size, *cells]))
-    return "\n".join([*lines, "", _measured(found)])
-
-
-def startup(found: dict[str, Any]) -> str:
-    """What a user waits for, beside what was asked."""
-    imported, tanks = (found["results"][f"startup {name}"] for name in ("import", "six tanks"))
-    rows = [
-        ["`import gsisio_jax` beyond `import jax`", imported["seconds"], "1.5"],
-        ["`design_observer`, six tanks", tanks["design_seconds"], "20"],
-        ["first `estimate`, six tanks: trace and compile", tanks["compile_seconds"], "20"],
-    ]
-    lines = [title(["", "seconds", "asked: below"]), *(line([what, f"{s:.2g}", most]) for what, s, most in rows)]
-    return "\n".join([*lines, "", _measured(found)])
+def plants(found: dict[str, Any]) -> str:
+    """The built-in examples."""
+    return f"{gallery.table(found['results'])}\n\n{_measured(found)}"
 
 
 def cells(found: dict[str, Any]) -> str:
@@ -110,9 +89,13 @@ def _measured(found: dict[str, Any]) -> str:
 
 
 _OTHERS = {"handwritten": "by hand", "C": "C", "older": "older version"}
+_KEPT = (
+    "ablation", "delay", "dials", "dials_rotation", "directions", "gradients", "models", "plants_before", "recovery",
+    "row_directions", "size", "tightness", "tightness_default",
+)  # fmt: skip
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
-    "throughput": throughput, "limit": limit, "rounding": rounding, "peers": peers, "startup": startup,
-    **dict.fromkeys(("delay", "directions", "ablation", "models", "size", "gradients"), cells), "soak": soak.table,
+    "limit": limit, "rounding": rounding, "peers": peers, "plants": plants, "soak": soak.table,
+    **dict.fromkeys(_KEPT, cells),
 }  # fmt: skip
 """By name of the file of results."""
 
