@@ -14,7 +14,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-RESULTS = Path(__file__).resolve().parent / "results"
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmarks" / "results"
 SIZES = {  # full, quick
     "compiled": ({"batch": 100_000, "steps": 100}, {"batch": 5_000, "steps": 50}),
     "limit": ({"batch": 102_400, "steps": 100}, {"batch": 4_096, "steps": 50}),
@@ -107,7 +108,7 @@ def run_apart(name: str, quick: bool, against: str | None = None, peers: str | N
     # As the command line of the library sets them, unless the user has; before JAX starts.
     flags = os.environ.get("XLA_FLAGS", options.extended(""))
     environment = {**os.environ, "XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, cwd=RESULTS.parent.parent, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=environment)
     if done.returncode:
         print(done.stderr, file=sys.stderr)
         return {"ok": False, "error": _last_error(done.stderr)}
@@ -130,8 +131,7 @@ def setting() -> dict[str, Any]:
         ]
         model = names[0] if names else model
     packages = ("jax", "numpy", "equinox", "gsisio_jax")
-    here = RESULTS.parent.parent
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=here, capture_output=True, text=True)
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True)
     return {
         "date": f"{datetime.now(UTC):%Y-%m-%d}",
         "commit": commit.stdout.strip(),

@@ -18,6 +18,7 @@ import numpy as np
 
 import gsisio_jax as gx
 from benchmarks.plants import from_tests
+from benchmarks.record import keep
 from gsisio_jax.observer import step
 
 RUNS, SETTLED = 40, 10
@@ -58,26 +59,38 @@ def taken_out(names: dict[str, Callable[..., Any]]) -> Iterator[None]:
 def main(systems: list[str]) -> int:
     jax.config.update("jax_enable_x64", True)
     plants = from_tests("systems")
+    table: dict[str, list[str]] = {}
     for name in systems:
         plant = replace(plants.s4(True) if name == "s4" else getattr(plants, name)(), sweeps=3)
         observer = plant.design()
         cases = [(f"without {what}" if names else "all of it", observer, names) for what, names in TAKEN_OUT.items()]
+        everything = np.ones(plant.system.n)
         cases += [(f"{k} sweeps", replace(observer, sweeps=k), {}) for k in (1, 2, 4)]
         for what, changed, names in cases:
             with taken_out(names):
-                print(f"{name:<4}{what:<36}{measured(changed, plant)}", flush=True)
+                count, x, d = measured(changed, plant)
+            print(f"{name:<4}{what:<36}{count:>8,}  x {_row(x)}  d {_row(d)}", flush=True)
+            everything = x if what == "all of it" else everything
+            table.setdefault(what, []).append(f"{count:,}{_worse(x / everything)}")
+    keep("ablation", ["", *(name.upper() for name in systems)], [[what, *row] for what, row in table.items()])
     return 0
 
 
-def measured(observer: gx.Observer, plant: Any) -> str:
-    """Operations of a step, and mean widths."""
+def _worse(ratios: np.ndarray) -> str:
+    """The factor by which the state that suffers most grows, where it does."""
+    worst = ratios.max()
+    return "" if worst < 1.01 else ", diverges" if not worst < 1e3 else f", {worst:.2f}"
+
+
+def measured(observer: gx.Observer, plant: Any) -> tuple[int, np.ndarray, np.ndarray]:
+    """Operations of a step, and mean widths of x and d."""
     run, _ = jax.jit(jax.vmap(plant.simulate))(jax.random.split(jax.random.key(0), RUNS))
     u = jnp.asarray(plant.u(plant.steps)) if plant.system.m else None
     estimate = jax.jit(jax.vmap(lambda y: gx.estimate(observer, plant.initial, y, u)))(run.y)
     sizes = from_tests("sizes")
     count = sum(sizes.step_program(observer, sizes.first_arguments(observer, plant)).count().values())
     x, d = (np.asarray(box.width)[:, SETTLED:].mean((0, 1)) for box in (estimate.state, estimate.input))
-    return f"{count:>8,}  x {_row(x)}  d {_row(d)}"
+    return count, x, d
 
 
 def _row(values: np.ndarray) -> str:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 import gsisio_jax as gx
+from benchmarks.record import keep, line, title
 from benchmarks.tightness import FROM, STEPS, Plant
 
 RECORDS = 5
@@ -23,10 +24,14 @@ def main() -> None:
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "oracles"))
     from delayed_plants import PLANTS
 
+    head, rows = ("Plant", "L", "window", "uniform, white", "at vertices, slow"), []
+    print(title(head))
     for name, ((A, C, G, H, w, v, start), delay) in PLANTS.items():
         plant = Plant(A, C, G, H / 10, *map(np.asarray, (w, v, start)))
         for window in (1, 3, 5):
-            print(f"{name:14}{delay} {window}  {'  '.join(_ratios(plant, delay, window))}", flush=True)
+            rows.append([name, str(delay), str(window), *_ratios(plant, delay, window)])
+            print(line(rows[-1]), flush=True)
+    keep("delay", head, rows)
 
 
 def _ratios(plant: Plant, delay: int, window: int) -> list[str]:
@@ -45,7 +50,7 @@ def _ratios(plant: Plant, delay: int, window: int) -> list[str]:
         assert min(one.ratio.min() for one in found) > 1 - 1e-9
         width, hull = (np.mean([getattr(one, name) for one in found], (0, 1)) for name in ("width", "hull_width"))
         worst = max(one.ratio.max() for one in found)
-        said.append(f"{(width / hull).min():.2f} to {(width / hull).max():.2f}, worst {worst:.2f}")
+        said.append(f"{(width / hull).min():.2f} to {(width / hull).max():.2f} ({worst:.3g})")
     return said
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 import gsisio_jax as gx
 from benchmarks.plants import case, records
+from benchmarks.record import keep, line, title
 from benchmarks.tightness import PLANTS, Plant
 
 SETTINGS: tuple[dict[str, Any], ...] = (
@@ -70,16 +71,20 @@ TASKS: dict[str, Callable[[], Task]] = {
 
 def main(names: list[str]) -> int:
     jax.config.update("jax_enable_x64", True)
-    print("| Plant | asked | window, rows, gains | width: median, narrowest | CPU time of a step | design s |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    head = "Plant", "asked", "window, rows, gains", "width: median, narrowest", "CPU time of a step", "design s"
+    rows = []
+    print(title(head))
     for name in names or TASKS:
-        for line in measured(TASKS[name]()):
-            print(f"| {name} | {line}", flush=True)
+        for cells in measured(TASKS[name]()):
+            rows.append([name, *cells])
+            print(line(rows[-1]), flush=True)
+    if not names:
+        keep("dials", head, rows)
     return 0
 
 
-def measured(task: Task) -> list[str]:
-    """A line of the table for every setting that differs from those before."""
+def measured(task: Task) -> list[list[str]]:
+    """A row of the table for every setting that differs from those before."""
     found: dict[tuple[int, ...], tuple[str, float, Any, np.ndarray]] = {}
     for dials in SETTINGS:
         began = time.process_time()
@@ -100,10 +105,8 @@ def measured(task: Task) -> list[str]:
     for (sizes, (said, design, _, width)), seconds in zip(found.items(), times, strict=True):
         both = np.isinf(width) & np.isinf(base)  # a last row that a delay leaves open
         share = np.where(both, 1.0, width / np.where(both, 1.0, base))
-        lines.append(
-            f"{said} | {', '.join(map(str, sizes[:3]))} | {np.median(share):.3f}, {share.min():.3f} | "
-            f"{seconds / times[0]:.2f} | {design:.1f} |"
-        )
+        widths = f"{np.median(share):.3f}, {share.min():.3f}"
+        lines.append([said, ", ".join(map(str, sizes[:3])), widths, f"{seconds / times[0]:.2f}", f"{design:.1f}"])
     return lines
 
 

@@ -14,6 +14,7 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import linprog
 
+from benchmarks.record import keep, line, title
 from benchmarks.tightness import Plant, chain, full_rank, rotation
 
 STEPS, LAST = 24, 8
@@ -109,13 +110,18 @@ def main() -> None:
         "rotation": rotation(), "one measured": one_measured(), "unseen": unseen(), "full_rank": full_rank(),
         "chain": chain(),
     }  # fmt: skip
+    kinds = ("box", 1), ("box", 3), ("box", 5), ("pairs", 1), ("window", 1)
+    head = "Plant", *(f"{kind}, {window} step{'s' * (window > 1)}" for kind, window in kinds)
+    rows = []
+    print(title(head))
     for name, plant in plants.items():
         steps = STEPS if len(plant.A) < 6 else 16
         y = plant.record(0, hard=False)[1][:steps]
         hull = widths(plant, y, directions("box", plant.A), steps)[-LAST:]
-        for kind, window in (("box", 1), ("box", 3), ("box", 5), ("pairs", 1), ("window", 1)):
-            ratio = (widths(plant, y, directions(kind, plant.A), window)[-LAST:] / hull).mean(0)
-            print(f"{name:14}{kind:8}{window} steps: {ratio.min():.2f} to {ratio.max():.2f}", flush=True)
+        found = [(widths(plant, y, directions(kind, plant.A), window)[-LAST:] / hull).mean(0) for kind, window in kinds]
+        rows.append([name, *(f"{ratio.min():.2f} to {ratio.max():.2f}" for ratio in found)])
+        print(line(rows[-1]), flush=True)
+    keep("directions", head, rows)
 
 
 if __name__ == "__main__":

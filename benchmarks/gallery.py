@@ -1,13 +1,11 @@
 """The built-in examples, one case each: what a newcomer waits for, how wide boxes get, and what was promised.
 
-``python -m benchmarks --only plants`` runs them; ``python -m benchmarks.gallery`` prints the table of its results.
+``python -m benchmarks --only plants --name plants`` runs them; `benchmarks.tables` makes the table of its results.
 """
 
 from __future__ import annotations
 
-import json
 import time
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -18,7 +16,6 @@ from benchmarks.throughput import peak
 
 NAMES = gx.examples.names()
 SETTLING = 20  # steps that the promise must have applied before widths count as settled
-RESULTS = Path(__file__).parent / "results"
 
 
 def plant(name: str, repeat: int, steps: int) -> dict[str, Any]:
@@ -128,11 +125,3 @@ def _kept(one: dict[str, Any]) -> str:
 
 def _digits(value: float) -> float:
     return float(f"{value:.2g}")
-
-
-def main() -> None:
-    print(table(json.loads((RESULTS / "plants.json").read_text())["results"]))
-
-
-if __name__ == "__main__":
-    main()

@@ -15,7 +15,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from benchmarks.record import keep
+
 HERE = Path(__file__).resolve().parent
+SYSTEMS = {"s1": "S1, two states, sines", "s5": "S5, six tanks", "s7": "S7, quadruple tank"}
 
 
 def main() -> int:
@@ -33,7 +36,7 @@ def main() -> int:
         print(json.dumps(here))
         return 0
     results = {}
-    for case in [c for c in ("s1", "s5", "s7", "memory") if options.only in ("", c)]:
+    for case in [c for c in (*SYSTEMS, "memory") if options.only in ("", c)]:
         sizes = [f"--{name}={getattr(options, name)}" for name in ("points", "steps", "batch")]
         done = subprocess.run(
             [sys.executable, "-m", "benchmarks.gradients", "--case", case, *sizes], capture_output=True, text=True,
@@ -44,9 +47,10 @@ def main() -> int:
             return 1
         results[case] = json.loads(done.stdout.strip().splitlines()[-1])
         print(line(case, results[case]), flush=True)
-    path = HERE / "results" / "gradients.json"
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(json.dumps(results, indent=2) + "\n")
+    checked = {case: result for case, result in results.items() if case != "memory"}
+    if set(checked) == set(SYSTEMS):
+        rows = [[SYSTEMS[case], *(f"{e:.1e}" for e in one["worst"].values())] for case, one in checked.items()]
+        keep("gradients", ["system", *next(iter(checked.values()))["worst"]], rows, results=results)
     return 0 if all(result["ok"] for result in results.values()) else 1
 
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from typing import Any
 
 import jax
 import numpy as np
 
-from benchmarks.__main__ import RESULTS, setting
 from benchmarks.plants import from_tests
+from benchmarks.record import keep, line, title
 
-HEAD = """| Model | n, l, p | design s | first call s | µs a step and box | last widths | missed | certificate |
-| --- | --- | --- | --- | --- | --- | --- | --- |"""
+HEAD = ("Model", "n, l, p", "design s", "first call s", "µs a step and box", "last widths", "missed", "certificate")
 _REPEAT = 20
 
 
@@ -25,13 +23,13 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     runner, models = from_tests("models.runner"), from_tests("models.gallery").MODELS
     rows = []
-    print(HEAD)
+    print(title(HEAD))
     for name in only or models:
         row = measured(name, models[name](), runner)
         rows.append(row)
-        print(line(row), flush=True)
+        print(line(cells(row)), flush=True)
     if not only:
-        (RESULTS / "models.json").write_text(json.dumps({"setting": setting(), "results": rows}, indent=2) + "\n")
+        keep("models", HEAD, list(map(cells, rows)))
 
 
 def measured(name: str, model: Any, runner: Any) -> dict[str, Any]:
@@ -59,14 +57,14 @@ def measured(name: str, model: Any, runner: Any) -> dict[str, Any]:
     return row
 
 
-def line(row: dict[str, Any]) -> str:
+def cells(row: dict[str, Any]) -> list[str]:
     widths = row["last_widths"]
     shown = ", ".join(f"{w:.2g}" for w in (widths if len(widths) < 7 else [min(widths), max(widths)]))
     shown = shown if len(widths) < 7 else f"{shown} (least, most)"
-    return (
-        f"| {row['model']} | {', '.join(map(str, row['sizes']))} | {row['design_s']:.2f} | {row['first_call_s']:.1f} | "
-        f"{row['us_per_step']:.1f} | {shown} | {row['missed']} | {row['certificate']} |"
-    )
+    return [
+        row["model"], ", ".join(map(str, row["sizes"])), f"{row['design_s']:.2f}", f"{row['first_call_s']:.1f}",
+        f"{row['us_per_step']:.1f}", shown, str(row["missed"]), row["certificate"],
+    ]  # fmt: skip
 
 
 if __name__ == "__main__":

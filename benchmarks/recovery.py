@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks import tightness
+from benchmarks import record, tightness
 from benchmarks.plants import from_tests
 from gsisio_jax.design.row_solver import RowSolver
 
@@ -39,6 +39,9 @@ class Counted:
         self.compiled += event.endswith("backend_compile_duration")
 
 
+HEAD = "Plant", "n, l, p", "design s", "linear programs", "compiled", "from any state", "after 1, 2, 3 lost rows"
+
+
 def plants() -> dict[str, tuple[np.ndarray, ...]]:
     """A, C, G, H and the magnitudes of w and v."""
     found = {}
@@ -53,8 +56,8 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     every, design = plants(), from_tests("recovery_plants").design
     design(every["rotation"])
-    print("| Plant | n, l, p | design s | linear programs | compiled | rows until finite: any state | 1, 2, 3 lost |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
+    table = []
+    print(record.title(HEAD))
     for name, plant in every.items():
         with Counted() as count:
             started = time.process_time()
@@ -62,8 +65,10 @@ def main() -> None:
             seconds = time.process_time() - started
         n, l, p = len(plant[0]), len(plant[1]), plant[2].shape[1]
         rows = [f"{certificate.rows_until_finite(lost).max():.0f}" for lost in (None, 1, 2, 3)]
-        print(f"| {name} | {n}, {l}, {p} | {seconds:.1f} | {count.programs} | {count.compiled} | {rows[0]} | "
-              f"{', '.join(rows[1:])} |", flush=True)  # fmt: skip
+        counts = f"{seconds:.1f}", str(count.programs), str(count.compiled)
+        table.append([name, f"{n}, {l}, {p}", *counts, rows[0], ", ".join(rows[1:])])
+        print(record.line(table[-1]), flush=True)
+    record.keep("recovery", HEAD, table)
 
 
 if __name__ == "__main__":

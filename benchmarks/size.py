@@ -9,6 +9,7 @@ from typing import Any
 import jax
 
 from benchmarks.plants import from_tests
+from benchmarks.record import keep
 
 STAGES = ("known", "predict", "initial", "sweeps", "certified", "inputs", "restart", "finish", "other")
 
@@ -29,6 +30,11 @@ def main() -> None:
     print(
         table(found, {sizes.key(name, v): row for name, rows in operations.items() for v, row in rows.items()}, budget)
     )
+    rows = [
+        [program, *(f"{row.get(stage, 0):,}" for stage in STAGES), f"{sum(row.values()):,}"]
+        for program, row in found.items()
+    ]
+    keep("size", ["equations of", *STAGES, "all"], rows)
     if write:
         sizes.BUDGET.write_text(json.dumps(found, indent=2, sort_keys=True) + "\n")
         print(f"\nwritten to {sizes.BUDGET}")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -22,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import expm
 
-from benchmarks.__main__ import RESULTS, setting
 from benchmarks.plants import from_tests
+from benchmarks.record import keep
 
 STEPS, FROM = 30, 15
 
@@ -135,8 +134,15 @@ def main() -> int:
             print(name)
             for dials, row in table[name].items():
                 print(f"  {dials}: " + ", ".join(f"{key} {value}" for key, value in row.items()), flush=True)
-    (RESULTS / "tightness.json").write_text(json.dumps({"setting": setting(), "table": table}, indent=1) + "\n")
+    head = "Plant", "window", "gains", "ratios, least to most", "rows", "design s", "µs a step and box"
+    keep("tightness", head, [_cells(name, row) for name, rows in table.items() for row in rows.values()], table=table)
     return 0
+
+
+def _cells(name: str, row: dict[str, Any]) -> list[str]:
+    ratios = [f"{min(row[kind]):.2f} to {max(row[kind]):.2f}" for kind in ("uniform", "vertices")]
+    sizes = str(row["length"]), str(row["gains"])
+    return [name, *sizes, f"{ratios[0]} ({ratios[1]})", str(row["rows"]), f"{row['design_s']:.1f}", f"{row['us']:.2f}"]
 
 
 def _dial(text: str) -> int | str:

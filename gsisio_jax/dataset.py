@@ -71,6 +71,7 @@ def to_dataset(
     time, time_attributes = _time(time, dt, steps)
     state_names, state_units = _labels("state", state_names, state_units, n, "x")
     input_names, input_units = _labels("input", input_names, input_units, p, "d")
+    _check_different([*state_names, *input_names])
     variables: dict[str, Any] = {}
     for index, (name, unit) in enumerate(zip(state_names, state_units, strict=True)):
         _add_bounds(variables, name, unit, "state", np.asarray(est.state.lower), np.asarray(est.state.upper), index)
@@ -157,12 +158,22 @@ def _time(time: Any, dt: float | None, steps: int) -> tuple[np.ndarray, dict[str
 def _labels(
     kind: str, names: Sequence[str] | None, units: Sequence[str] | None, count: int, letter: str
 ) -> tuple[list[str], list[str]]:
+    for what, values in (("names", names), ("units", units)):
+        if isinstance(values, str):
+            raise ValueError(f"to_dataset: `{kind}_{what}` must be a list of {count} words, got the word {values!r}")
     names = [f"{letter}{index + 1}" for index in range(count)] if names is None else list(names)
     units = [""] * count if units is None else list(units)
     for what, values in (("names", names), ("units", units)):
         if len(values) != count:
             raise ValueError(f"to_dataset: `{kind}_{what}` has {len(values)} entries, the estimate has {count}")
     return names, units
+
+
+def _check_different(names: list[str]) -> None:
+    """One column would take the place of another, without a word."""
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"to_dataset: two signals are called {twice!r}; give every state and input a name of its own")
 
 
 def _spoken(name: str) -> str:

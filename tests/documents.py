@@ -2,7 +2,8 @@
 
 A fence in Python is code; ``gsisio`` lines of a fence in ``sh`` are commands. A fence with ``title="name"`` is a file
 of that name. ``<!-- output -->`` before a ``text`` fence: every line of it must occur in what the blocks before it have
-said since the last such fence; ``...`` stands for anything. ``<!-- not run: why -->`` before a fence leaves it out.
+said since the last such fence, whole, in this order, numbers to a thousandth;
+``...`` stands for anything. ``<!-- not run: why -->`` before a fence leaves it out.
 """
 
 from __future__ import annotations
@@ -22,6 +23,9 @@ ROOT = Path(__file__).parents[1]
 FENCE = re.compile(
     r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<info>[^\n]*)\n(?P<text>.*?)^```$", re.DOTALL | re.MULTILINE
 )
+# Not part of a name (x1), a date or a longer number.
+NUMBER = r"(?<![\w.])[-+]?(?:\d[\d,]*(?:\.(?!\.)\d*)?|\.\d+)(?:[eE][-+]?\d+)?(?![\w]|[.,]\d)"
+CLOSE = 1e-3
 PYTHON, SHELL = ("python", "py"), ("sh", "bash", "shell", "console")
 
 
@@ -67,10 +71,37 @@ def blocks(page: Path) -> list[Block]:
 
 
 def absent(expected: str, said: str) -> list[str]:
-    """Lines of a fence that were not said. Blanks count as one; ``...`` stands for anything within a line."""
-    plain = re.sub(r"\s+", " ", said)
-    lines = [re.sub(r"\s+", " ", line).strip() for line in expected.splitlines()]
-    return [line for line in lines if not re.search(".*".join(re.escape(part) for part in line.split("...")), plain)]
+    """Lines of a fence that were not said, in this order, as whole lines.
+
+    Blanks count as one; ``...`` stands for anything within a line. Text must be equal, whole numbers too, others to
+    ``CLOSE`` of their size.
+    """
+    lines, place, missed = [" ".join(line.split()) for line in said.splitlines()], 0, []
+    for line in (" ".join(line.split()) for line in expected.splitlines()):
+        # From the line found last: a long line of the program may be several of the page.
+        found = next((i for i in range(place, len(lines)) if _agrees(line, lines[i])), None)
+        if found is None:
+            missed.append(line)
+        else:
+            place = found
+    return missed
+
+
+def _agrees(expected: str, said: str) -> bool:
+    parts = re.split(rf"({NUMBER}|\.\.\.)", expected)
+    texts, marks = parts[::2], parts[1::2]
+    pattern = re.escape(texts[0])
+    for mark, text in zip(marks, texts[1:], strict=True):
+        pattern += (".*" if mark == "..." else f"({NUMBER})") + re.escape(text)
+    match = re.fullmatch(pattern, said)
+    numbers = [mark for mark in marks if mark != "..."]
+    return match is not None and all(map(_close, numbers, match.groups()))
+
+
+def _close(expected: str, said: str) -> bool:
+    a, b = (float(number.replace(",", "")) for number in (expected, said))
+    whole = all(re.fullmatch(r"[-+]?[\d,]+", number) for number in (expected, said))
+    return a == b if whole else abs(a - b) <= CLOSE * abs(a) + 1e-12
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsisio_jax.continuous import maps
 from gsisio_jax.continuous.merging import merged
-from gsisio_jax.plant.traced import equations
+from gsisio_jax.traced import equations
 
 _JAX = jax.__file__.rpartition("/")[0]
 

@@ -104,7 +104,8 @@ def affine_abstraction(
 def _cells(region: Any, mesh: Any) -> tuple[np.ndarray, np.ndarray, bool]:
     """Lower and upper corners (cells, n) of the mesh, and whether it is the region itself."""
     if not isinstance(region, Interval) or len(region.shape) != 1 or not region.shape[0]:
-        raise refusal(f"`region` must be an Interval of shape (n,) with n >= 1, got {getattr(region, 'shape', region)}")
+        got = f"a box of shape {region.shape}" if isinstance(region, Interval) else type(region).__name__
+        raise refusal(f"`region` must be an Interval of shape (n,) with n >= 1, got {got}")
     low, high = np.asarray(region.lower, np.float64), np.asarray(region.upper, np.float64)
     n = len(low)
     good = np.isfinite(high - low) & (low <= high)

@@ -16,6 +16,7 @@ from gsisio_jax.design.slices import check_split
 from gsisio_jax.design.tolerant import check_tolerate
 from gsisio_jax.inclusion.intersection import DEFAULT, check_methods
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.tolerant import TolerantObserver
@@ -200,6 +201,13 @@ def design_observer(
     given, u_region = checked(system, noise, region, form, gains, u_region, sweeps, window, missing, certify, progress)
     check_tolerate(tolerate, system, form, missing, window, delay)
     check_split(split, form)
+    if derivative is not None:
+        check_type("design_observer", "derivative", derivative, Interval, "one interval for every partial derivative")
+        if form != "prediction":
+            raise ValueError(
+                f'design_observer: `derivative` is for form="prediction", got form={form!r}; leave it out, or bound '
+                "your own functions with inclusion.register_bounds"
+            )
     near = read_around(system, around, given is None)
     late = check_delay(delay, system, form)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.certificate import spectral_radius
 from gsisio_jax.plant.system import System
 
@@ -73,6 +74,7 @@ def framer_gains(system: System, left_inverse: Any = None) -> FramerGains:
 
     Source: paper, Theorem 1 (with A_y supplied, theory 2.7).
     """
+    check_type("framer_gains", "system", system, System)
     G, H, B, D = (np.asarray(matrix, dtype=np.float64) for matrix in (system.G, system.H, system.B, system.D))
     n = system.n
     stacked = np.vstack([G, H])

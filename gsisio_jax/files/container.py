@@ -37,7 +37,7 @@ def write(call: str, path: str | os.PathLike[str], kind: str, about: dict[str, A
     Raises:
         OSError: it cannot be written there; an older file is untouched.
     """
-    target = Path(path)
+    target = _file(call, path)
     stream = io.BytesIO()
     arrays: dict[str, np.ndarray] = {}
     header = {"kind": f"gsisio_jax.{kind}", "version": VERSION, "library": __version__, "about": about}
@@ -50,6 +50,15 @@ def write(call: str, path: str | os.PathLike[str], kind: str, about: dict[str, A
         raise OSError(error.errno, f"{call}: {error.strerror or error}", str(target)) from error
 
 
+def _file(call: str, path: Any) -> Path:
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"{call}: `path` must be the name of a file, got {type(path).__name__}")
+    target = Path(path)
+    if not target.name or target.is_dir():
+        raise ValueError(f"{call}: `path` must be the name of a file, {str(path)!r} is a folder; add a name to it")
+    return target
+
+
 def read(call: str, path: str | os.PathLike[str], kind: str) -> tuple[dict[str, Any], Node, dict[str, np.ndarray]]:
     """What a file says: the header's `about`, the structure and the arrays of the pytree (see `restore`).
 
@@ -57,8 +66,11 @@ def read(call: str, path: str | os.PathLike[str], kind: str) -> tuple[dict[str, 
         OSError: it is not there, or may not be read.
         ValueError: it is no such file, is damaged, or was written by a version of the library that this one is not.
     """
-    target = Path(path)
-    data = target.read_bytes()
+    target = _file(call, path)
+    try:
+        data = target.read_bytes()
+    except OSError as error:
+        raise OSError(error.errno, f"{call}: {error.strerror or error}", str(target)) from error
     try:
         members = _members(data)
         header = json.loads(members.pop(_HEADER).tobytes())

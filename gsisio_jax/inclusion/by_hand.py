@@ -35,6 +35,11 @@ def register_bounds(name: str, natural: Callable[..., Interval], derivative: Cal
 
     Source: theory 9.
     """
+    if not isinstance(name, str):
+        raise ValueError(
+            f"register_bounds: `name` must be that of a primitive or of a jitted function, got {type(name).__name__}; "
+            "f.__name__"
+        )
     if not callable(natural) or not (derivative is None or callable(derivative)):
         raise ValueError(f"register_bounds: `natural` and `derivative` for {name!r} must be functions of intervals")
     BY_HAND[name] = _ByHand(natural, derivative)

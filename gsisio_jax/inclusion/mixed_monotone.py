@@ -30,6 +30,7 @@ from gsisio_jax.inclusion.transforms import AffineForm, affine
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.minmax import larger, largest, smaller, smallest
 from gsisio_jax.interval.primitives import times
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.interval.rounding import Rounding, as_nearest, rounded_by
 
 MAX_CORNER_DIMENSION = 10
@@ -49,6 +50,7 @@ def decomposition_gain(derivative: Interval) -> Any:
 
     Source: paper, (eq:decompconstruct); theory 9.
     """
+    check_type("decomposition_gain", "derivative", derivative, Interval, "inclusion.jacobian(f)(box) is one")
     a, b = derivative.lower, derivative.upper
     return jnp.where((a >= 0) | (b <= 0), 0, jnp.where(-a <= b, -a, b))
 
@@ -68,6 +70,7 @@ def width_gain(derivative: Interval) -> Any:
 
     Source: theory 2.11 (the paper's Lemma 2 has one constant for all rows).
     """
+    check_type("width_gain", "derivative", derivative, Interval, "inclusion.jacobian(f)(box) is one")
     a, b = derivative.lower, derivative.upper
     return jnp.maximum(jnp.abs(a), jnp.abs(b)) + 2 * decomposition_gain(derivative)
 

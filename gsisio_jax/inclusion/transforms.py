@@ -17,6 +17,7 @@ from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node,
 from gsisio_jax.interval.box import Interval, choose
 from gsisio_jax.interval.primitives import add_up
 from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
+from gsisio_jax.traced import refuse_trace
 from gsisio_jax.tracing import explained
 
 
@@ -190,11 +191,30 @@ def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable
         raise ValueError(f"inclusion: bounds are of a function of x, got {type(f).__name__}")
     with explained(f"inclusion: calling the function with x of shape {x.shape}"):
         closed, out = jax.make_jaxpr(f, return_shape=True)(jax.ShapeDtypeStruct(x.shape, x.dtype), *shapes)
+    _check_results(closed, x.shape)
     inputs = [x, *jax.tree.leaves(values, is_leaf=is_node)]
     results = evaluate(closed.jaxpr, closed.consts, inputs)
     nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
     nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
     return jax.tree.unflatten(jax.tree.structure(out), [finish(_in_type(node, x.dtype)) for node in nodes])
+
+
+def _check_results(closed: Any, shape: tuple[int, ...]) -> None:
+    """Refuse what would get bounds that are none, without a word."""
+    refuse_trace(
+        "inclusion: the function",
+        closed,
+        "Give the random number as a further argument, a box of all its values",
+        f"the box has shape {shape}",
+    )
+    if not closed.out_avals:
+        raise ValueError("inclusion: the function returns nothing (None); let it return an array")
+    for out in closed.out_avals:
+        if jnp.issubdtype(out.dtype, jnp.complexfloating):
+            raise ValueError(
+                f"inclusion: the function must return real numbers, it returns {out.dtype}; return real and imaginary "
+                "parts, jnp.stack([z.real, z.imag])"
+            )
 
 
 def _in_type(node: Node, dtype: Any) -> Node:

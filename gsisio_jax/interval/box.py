@@ -144,6 +144,16 @@ class Interval(eqx.Module):
     def __contains__(self, value: Any) -> bool:
         raise TypeError("Interval: `x in box` would not say of which components; use box.contains(x), then .all()")
 
+    def _no_arithmetic(self, *_: Any) -> Any:
+        raise TypeError(
+            "Interval: a box has no arithmetic of its own; gx.inclusion.natural(f)(box) bounds a function f on it. Its "
+            "sides are the arrays box.lower and box.upper"
+        )
+
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __matmul__ = __rmatmul__ = _no_arithmetic
+    __truediv__ = __rtruediv__ = __pow__ = __rpow__ = __neg__ = __abs__ = _no_arithmetic
+    __lt__ = __le__ = __gt__ = __ge__ = _no_arithmetic
+
     def contains(self, value: Any, margin: float = 0.0) -> Any:
         """Elementwise: is ``value`` inside, with `margin` to spare?
 
@@ -157,6 +167,8 @@ class Interval(eqx.Module):
         """
         if type(value) is not np.ndarray:
             value = read_array("Interval.contains", "value", value, missing=True)
+        if type(margin) is not float:
+            margin = read_array("Interval.contains", "margin", margin)
         _check_fits(self.shape, value.shape)
         return (self.lower + margin <= value) & (value <= self.upper - margin)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -74,6 +74,8 @@ class Estimate(eqx.Module):
             observer: that of the run; then what its certificate is worth here is said, too.
             u: known inputs (T, m) of the run; then those outside of `u_region` are counted.
         """
+        if observer is not None:
+            check_type("Estimate.summary", "observer", observer, get_args(AnyObserver), "that of the run")
         return summary(self, observer, u)
 
     def to_xarray(self, **labels: Any) -> Any:
@@ -229,7 +231,16 @@ def _as(carry: Carry, dtype: Any) -> Carry:
 
 
 def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
-    """Join the outputs of `start`, `step` and `resume`, in order, into the `Estimate` of the whole record."""
+    """Join the outputs of `start`, `step` and `resume`, in order, into the `Estimate` of the whole record.
+
+    Raises:
+        ValueError: there are none, or something else is among them.
+    """
+    if not isinstance(outputs, Sequence) or not outputs:
+        got = "none" if isinstance(outputs, Sequence) else type(outputs).__name__
+        raise ValueError(f"collect: `outputs` must be a list of what gx.start, gx.step and resume return, got {got}")
+    for out in outputs:
+        check_type("collect", "outputs", out, StepOutput, "the second of what gx.start, gx.step and resume return")
     rows = [jax.tree.map(lambda x: x[None], out) if jnp.ndim(out.status) == 0 else out for out in outputs]
     return _as_estimate(observer, jax.tree.map(lambda *x: jnp.concatenate(x), *rows))
 

@@ -22,7 +22,7 @@ from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, choose, intersect, magnitude, nan_to_unbounded, widen
 from gsisio_jax.interval.image import image, loose_matvec_upper
 from gsisio_jax.interval.primitives import multiplied, scale
-from gsisio_jax.interval.rounding import Rounding
+from gsisio_jax.interval.rounding import Rounding, check_rounding
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.domain import Domain, largest_magnitude
 from gsisio_jax.observer.measurement import in_box, inside, output_box
@@ -74,6 +74,7 @@ class PredictionObserver(eqx.Module):
 
     def with_rounding(self, rounding: Rounding) -> PredictionObserver:
         """The same observer with another rounding."""
+        check_rounding("PredictionObserver.with_rounding", rounding)
         return replace(self, rounding=rounding)
 
     def astype(self, dtype: Any) -> PredictionObserver:

@@ -17,7 +17,7 @@ import numpy as np
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval, is_concrete
-from gsisio_jax.interval.rounding import Rounding
+from gsisio_jax.interval.rounding import Rounding, check_rounding
 from gsisio_jax.observer.bank import CancellationResidual, LinearBounds
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.plant.system import Noise, System
@@ -172,6 +172,7 @@ class Observer(eqx.Module):
 
     def with_rounding(self, rounding: Rounding) -> Observer:
         """The same observer with another rounding."""
+        check_rounding("Observer.with_rounding", rounding)
         found = replace(self, rounding=rounding)
         if "_single" in vars(self) and rounding == "outward":
             object.__setattr__(found, "_single", vars(self)["_single"])

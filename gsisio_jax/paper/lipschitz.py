@@ -20,6 +20,7 @@ import numpy as np
 from gsisio_jax import inclusion
 from gsisio_jax.inclusion.mixed_monotone import decomposition_gain, width_gain
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.plant.system import System
 
 _BATCH = 64  # boxes per call of the engine: one shape, one compilation
@@ -163,6 +164,8 @@ def lipschitz_constants(
 
 def check_region(call: str, system: System, region: Interval, u_region: Interval | None) -> Interval:
     """The box of known inputs to use, after the shapes were checked."""
+    check_type(call, "system", system, System)
+    check_type(call, "region", region, Interval, f"gx.Interval(lower, upper) of shape ({system.n},)")
     if region.shape != (system.n,):
         raise ValueError(f"{call}: `region` must have shape ({system.n},), got {region.shape}")
     if u_region is None:

@@ -21,6 +21,7 @@ import numpy as np
 from gsisio_jax.design.framer import framer_gains
 from gsisio_jax.design.lmi import LmiAnswer, iss_lmi, printed_lmi
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.certificate import spectral_radius
 from gsisio_jax.paper.lipschitz import LipschitzConstants, lipschitz_constants, spectral_norm
 from gsisio_jax.plant.system import Noise, System
@@ -188,6 +189,8 @@ def stability(
 
     Source: paper, Theorem 2; theory 2.8-2.11.
     """
+    check_type("stability", "system", system, System)
+    check_type("stability", "noise", noise, Noise)
     for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
         if box.shape != (size,):
             raise ValueError(f"stability: the noise bounds of `{name}` must have shape ({size},), got {box.shape}")

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsisio_jax.interval.reading import check_type
 from gsisio_jax.paper.lipschitz import spectral_norm
 from gsisio_jax.paper.stability import Stability
 
@@ -65,6 +66,7 @@ def width_bounds(stability: Stability, initial_width: Any, steps: int, printed: 
 
     Source: paper, Lemma 5; theory 2.8 and 2.10.
     """
+    check_type("width_bounds", "stability", stability, Stability, "what paper.stability returns")
     first = np.asarray(initial_width, np.float64)
     if first.shape != stability.noise_width.shape or not (np.isfinite(first).all() and (first >= 0).all()):
         raise ValueError(

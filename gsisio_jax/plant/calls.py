@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gsisio_jax.plant.traced import check_trace
+from gsisio_jax.traced import check_trace
 from gsisio_jax.tracing import explanation
 
 _POSITIONAL = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)

@@ -80,6 +80,8 @@ def save(
     """
     module = style.require("matplotlib.figure")
     record = read_record(dataset_or_estimate)
+    if not isinstance(path, str | Path):
+        raise ValueError(f"plot.save: `path` must be the name of a file, got {type(path).__name__}; say 'boxes.png'")
     names = list(record.series) if signals is None else list(signals)
     figure = module.Figure(layout="constrained")
     axes = style.stacked(figure, len(names))

@@ -241,7 +241,22 @@ def _select(graph: Graph, which: Any, *cases: Any) -> Any:
         return graph.apply("select_n", which.operands[0], cases[1], first, dtype=first.dtype)
     if len(cases) == 2 and first.dtype == bool and all(map(is_constant, cases)):
         return graph.apply("not", which) if first else which
+    if len(cases) == 2 and (kept := _replaced(which, *cases)) is not None and not is_constant(kept[0]):
+        before = kept[0]
+        if before.name == "select_n" and (inner := _replaced(*before.operands)) is not None and inner[1:] == kept[1:]:
+            return before  # what an operation has left, the same one leaves
     return None
+
+
+def _replaced(which: Any, *cases: Any) -> tuple[Any, ...] | None:
+    """Of ``x if x > limit else other``, in any comparison: x, and what the operation is; None of something else."""
+    if is_constant(which) or len(which.operands) != 2 or len(cases) != 2 or not is_constant(which.operands[1]):
+        return None
+    x, limit = which.operands
+    place = next((i for i, case in enumerate(cases) if case is x), None)
+    if place is None or not is_constant(other := cases[1 - place]):
+        return None
+    return x, which.name, place, limit.tobytes(), other.tobytes()
 
 
 def _junction(name: str, absorbing: bool) -> Callable[..., Any]:

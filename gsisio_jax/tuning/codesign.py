@@ -90,6 +90,11 @@ def optimal_widths(plant: Plant, theta: Any, u_region: Interval | None = None) -
 
     Source: theory 4.
     """
+    if not callable(plant):
+        raise ValueError(
+            f"optimal_widths: `plant` must be a function of theta that returns (system, noise, region), got "
+            f"{type(plant).__name__}"
+        )
     try:
         system, noise, region = plant(theta)
     except ValueError as error:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import jax
 import numpy as np
 import pytest
@@ -32,6 +34,15 @@ def test_alarms_of_the_oracle_and_no_others(estimate, oracle_run):
         # States are east, north, velocity east, velocity north; the oracle's gaps are the largest that can be proved.
         exact = oracle_run.gap[alarm.step, alarm.index % 2, alarm.index // 2]
         assert 0.9 * exact < alarm.gap <= exact + 1e-6
+
+
+def test_the_first_page_names_these_alarms(estimate, config):
+    page = (Path(__file__).parents[2] / "docs" / "README.md").read_text(encoding="utf-8")
+    names, units = ([state[key] for state in config["signals"]["state"]] for key in ("name", "unit"))
+    said = [alarm.describe(state_names=names, state_units=units) for alarm in estimate.alarms()]
+    assert said
+    assert [line for line in said if line not in page] == []
+    assert f"conflicts     {len(said)}, at " in page
 
 
 def test_state_boxes_are_the_exact_ones(estimate, exact):

@@ -11,6 +11,7 @@ import pytest
 from inclusion_functions import slopes, values
 from inclusion_points import grid
 from jax import lax
+from mpmath import mp
 
 from gsisio_jax import inclusion
 from gsisio_jax.interval import Interval
@@ -254,3 +255,26 @@ def test_wide_sigmoid_is_cut_by_a_secant():
     # The tangent at the middle would leave a rest of width 4; slope 0 one of width 2.
     form = inclusion.affine(scalar(jnp.tanh))(box(-3.0, 3.0))
     assert form.offset.width < 0.9
+
+
+@pytest.mark.parametrize(("function", "phase"), [(jnp.sin, 0.5), (jnp.cos, 0.0)], ids=["sin", "cos"])
+@pytest.mark.parametrize("side", [1, -1], ids=["crest", "trough"])
+def test_a_crest_is_found_and_none_is_made_up(function, phase, side):
+    """Boxes of all widths that end next to a crest, or beyond it: the largest value is the true one, padded."""
+    rng = np.random.default_rng(0)
+    with mp.workdps(60):
+        half = +mp.pi
+        crests = [(phase + 2 * int(k) + (side < 0)) * half for k in rng.integers(-2000, 2000, 300)]
+        ends = np.array([float(c) for c in crests])
+        width, near = 10 ** rng.uniform(-9, 0.4, 300), rng.integers(-3, 4, 300) * np.spacing(abs(ends))
+        ends = ends + np.where(rng.random(300) < 0.5, near, width * rng.random(300))
+        starts = ends - width
+        true = [
+            mp.mpf(1) if mp.mpf(b) >= c else side * (mp.sin if function is jnp.sin else mp.cos)(mp.mpf(b))
+            for b, c in zip(ends.tolist(), crests, strict=True)
+        ]
+    method = inclusion.natural(lambda x: side * function(x[0]), rounding="outward")
+    bounds = jax.jit(jax.vmap(method))(Interval(starts[:, None], ends[:, None]))
+    pad = 40 * np.finfo(float).eps * (2 + abs(ends))
+    for upper, value, most in zip(np.asarray(bounds.upper).tolist(), true, pad.tolist(), strict=True):
+        assert value <= upper <= value + most

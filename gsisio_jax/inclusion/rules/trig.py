@@ -86,19 +86,23 @@ def _middle(a: Any, b: Any) -> tuple[Any, Any, Any]:
 
 
 def _wave_padded(exact: Interval, cosine: bool, m: Any, r: Any) -> Interval:
-    """Outward by what the formulas of `Wave` lose.
+    """Outward by what the formulas of `Wave` lose."""
+    radius = _wave_loss(cosine, m, r)
+    return exact if radius is None else Interval.unchecked(exact.lower - radius, exact.upper + radius)
+
+
+def _wave_loss(cosine: bool, m: Any, r: Any) -> Any:
+    """What the formulas of `Wave` lose at most; None to nearest.
 
     With SLOT = 2, `sin_cos` is off by 2 eps at most, and by ``3 eps |t|`` in the sine. m and r are off by ``eps (|m| +
     r)`` together, and the derivative of every bound here by m or r is at most 2 in magnitude. Every product of two or
     three such values, and sum of three, stays below ``14 eps (k + |m| + r)``, k = 1 for a cosine and 0 for a sine,
-    which vanishes with m and r. A crest that rounding hides lies within ``4 eps (|m| + r)`` of an end: half of the
-    square of that is what the value there misses, below ``eps`` times this again within `LIMIT`.
+    which vanishes with m and r. No crest is hidden by rounding: where there is one, the value in the middle is below
+    ``cos r`` by less than this at most (for the sine ``|m| + r`` is at least pi/2 there).
     """
     if not rounding.outward():
-        return exact
-    size = abs(m) + r + (1.0 if cosine else 0.0)
-    radius = rounding.error(size, 8 * SLOT)
-    return Interval.unchecked(exact.lower - radius, exact.upper + radius)
+        return None
+    return rounding.error(abs(m) + r + (1.0 if cosine else 0.0), 8 * SLOT)
 
 
 def crosses(phase: float, period: float, a: Any, b: Any) -> Any:
@@ -107,16 +111,19 @@ def crosses(phase: float, period: float, a: Any, b: Any) -> Any:
 
 
 def _wave_range(cosine: bool, sign: float, parts: _WaveParts) -> Interval:
-    """Range of ``sign`` times the sine or the cosine."""
+    """Range of ``sign`` times the sine or the cosine.
+
+    A crest lies inside where its distance from m, in [0, pi], is at most r: where the value in m is at least ``cos r``.
+    """
     usable, m, r, sine, other, half_sin, half_cos = parts
     value, steepness = (other, sine) if cosine else (sine, other)
-    even, odd = sign * value * (1 - 2 * half_sin**2), jnp.abs(steepness) * 2 * half_sin * half_cos
-    a, b = m - r, m + r
-    crest = (0.0 if cosine else np.pi / 2) + (np.pi if sign < 0 else 0.0)
-    top = ~usable | crosses(crest, 2 * np.pi, a, b)
-    bottom = ~usable | crosses(crest + np.pi, 2 * np.pi, a, b)
-    found = _wave_padded(Interval.unchecked(even - odd, even + odd), cosine, m, r)
-    lower, upper = jnp.where(bottom, -1, found.lower), jnp.where(top, 1, found.upper)
+    value = value if sign > 0 else -value
+    turned = 1 - 2 * half_sin**2
+    even, odd = value * turned, jnp.abs(steepness) * 2 * half_sin * half_cos
+    pad = _wave_loss(cosine, m, r)
+    limit, odd = (turned, odd) if pad is None else (turned - pad, odd + pad)
+    lower = jnp.where(usable & (-value < limit), even - odd, -1)
+    upper = jnp.where(usable & (value < limit), even + odd, 1)
     return Interval.unchecked(jnp.maximum(lower, -1), jnp.minimum(upper, 1))
 
 

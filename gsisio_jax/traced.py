@@ -8,7 +8,7 @@ from typing import Any
 import jax.extend.core as jex
 import numpy as np
 
-from gsisio_jax.plant.indices import beyond
+from gsisio_jax.indices import beyond
 
 _RANDOM = (
     "random_bits",
@@ -32,22 +32,37 @@ def check_trace(name: str, first: Any, second: Any) -> None:
     Raises:
         ValueError: one of these, with the remedy.
     """
-    random = sorted({eqn.primitive.name for eqn in equations(first.jaxpr)}.intersection(_RANDOM))
-    if random:
-        raise ValueError(
-            f"System: {name} draws random numbers (`{random[0]}`), so it is no function of x. Noise is w and v, which "
-            "the Noise bounds; gx.simulate draws them"
-        )
+    refuse_trace(
+        f"System: {name}",
+        first,
+        "Noise is w and v, which the Noise bounds; gx.simulate draws them",
+        "x has one entry per row of G, u one per known input",
+    )
+
     if not _same(list(_numbers(first)), list(_numbers(second))):
         raise ValueError(
             f"System: {name} is another function every time it is called: its constants differ (numpy.random? the "
             "time? a counter?). Compute them once, outside of it; noise is w and v"
         )
-    if found := beyond(first):
+
+
+def refuse_trace(function: str, closed: Any, random: str, entries: str) -> None:
+    """Refuse a function that draws random numbers or reads entries that are not there.
+
+    Args:
+        function: what messages call it.
+        closed: its closed jaxpr.
+        random: what to do in the place of random numbers.
+        entries: which entries there are.
+    """
+    drawn = sorted({eqn.primitive.name for eqn in equations(closed.jaxpr)}.intersection(_RANDOM))
+    if drawn:
+        raise ValueError(f"{function} draws random numbers (`{drawn[0]}`), so it is no function of x. {random}")
+    if found := beyond(closed):
         index, shape = found
         raise ValueError(
-            f"System: {name} reads index {index} of an array of shape {shape}, which ends before it (JAX would "
-            "take another entry, or none, without a word); x has one entry per row of G, u one per known input"
+            f"{function} reads index {index} of an array of shape {shape}, which ends before it (JAX would "
+            f"take another entry, or none, without a word); {entries}"
         )
 
 

@@ -1,0 +1,33 @@
+"""What an experiment prints as a table, kept as a small file in benchmarks/results for `benchmarks.tables`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from benchmarks.__main__ import RESULTS, setting
+
+
+def keep(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], **more: Any) -> None:
+    """Write results/NAME.json: the cells of the table, when and where they were measured, and `more`.
+
+    Args:
+        name: that of the file and of the mark in README.md.
+        head: titles of the columns.
+        rows: cells, as they are shown.
+        more: what else belongs to it, JSON.
+    """
+    RESULTS.mkdir(exist_ok=True)
+    found = {"setting": setting(), "head": list(head), "rows": [list(row) for row in rows], **more}
+    (RESULTS / f"{name}.json").write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def line(cells: Sequence[str]) -> str:
+    """A row of Markdown."""
+    return f"| {' | '.join(cells)} |"
+
+
+def title(head: Sequence[str]) -> str:
+    """The first two lines of a table."""
+    return f"{line(head)}\n{line(['---'] * len(head))}"
