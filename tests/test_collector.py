@@ -18,11 +18,20 @@ def usual() -> Iterator[None]:
 
 
 def test_it_is_rare_inside_and_as_before_afterwards(usual):
-    with pytest.raises(KeyError), rare_collection():
+    with rare_collection():
         with rare_collection():
             assert gc.get_threshold()[0] > 700
         assert gc.get_threshold()[0] > 700
-        raise KeyError
+    assert gc.get_threshold() == (700, 10, 10)
+
+
+def test_an_error_leaves_it_as_before(usual):
+    def failing() -> None:
+        with rare_collection():
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        failing()
     assert gc.get_threshold() == (700, 10, 10)
 
 
