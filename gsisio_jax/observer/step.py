@@ -16,7 +16,7 @@ from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, nan_to_unbounded
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
-from gsisio_jax.observer import cells, input_memory, periodic, recovery, restart, window
+from gsisio_jax.observer import cells, input_memory, past_cells, periodic, recovery, restart, window
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
@@ -47,7 +47,8 @@ def blank(observer: Observer, initial: Interval) -> Carry:
     h = AtomBounds(jnp.zeros((atoms, n), dtype), zero, zero + jnp.inf, entire, *values)
     yes, no = jnp.asarray(True), jnp.asarray(False)
     carry = Carry(initial, h, jnp.full(l, jnp.nan, dtype), jnp.zeros(m, dtype), noise, yes, no)
-    return replace(carry, older=before_all(carry, observer), memory=input_memory.blank(observer, dtype))
+    memory, rows = input_memory.blank(observer, dtype), past_cells.unknown(observer, dtype)
+    return replace(carry, older=before_all(carry, observer), memory=memory, rows=rows)
 
 
 @rounding.by_observer
@@ -132,8 +133,12 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         domain = _output(domain, maps.states(domain.box), first.on(domain.box), known.z)
         lost = Lost(observer, d_fixed)
         domain = initial_boxes(maps, domain, right, lost.inputs, u)
+    if observer.past_cells:
+        domain, right, d_fixed = past_cells.contract(maps, domain, carry, known, lost, right, d_fixed)
     if observer.cells:
-        domain = cells.contract(maps, domain, known.z, u)
+        rights = [(observer.gains.remainder, plainly_wider(right, lost.radius(constants.gains, domain.box)))]
+        rights.extend(past_cells.solved(maps, domain, known, lost.magnitudes(domain.box)[0]))
+        domain = cells.contract(maps, domain, known.z, rights, past_cells.directions(observer), u)
     with _stage("initial"):
         # What the gains leave of x[k] and d[k-1]: smaller boxes to come can only make it smaller.
         left = [lost.radius(of, domain.box) for of in (constants.gains, constants.inverses)]
@@ -239,7 +244,8 @@ def _finish(
     )
     older = shifted(carry, observer, d, conflict & fallback.conflict if hold else conflict)
     memory = input_memory.after(observer, carry, d, conflict, hold)
-    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed, older, memory)
+    rows = past_cells.after(observer, domain, carry)
+    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed, older, memory, rows)
     return after, StepOutput(state, d, d_now, bit_mask(bits), *domain.report())
 
 

@@ -133,7 +133,8 @@ class Observer(eqx.Module):
         recovery: rows that need no box to begin with (`observer.recovery.Recovery`), those of one length together.
         input_rows: rows for the unknown input over several steps (`observer.input_memory.InputRows`), or None.
         corrections: Newton steps to the point that the certified bound is around (theory 5.6).
-        cells: into how many parts the box of every state is cut for the outputs (`observer.cells`); () for none.
+        cells: into how many parts the box of x[k] is cut along every state (`observer.cells`); () for none.
+        past_cells: the same of x[k-1].
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
     """
 
@@ -163,6 +164,7 @@ class Observer(eqx.Module):
     input_rows: Any = None
     corrections: int = eqx.field(static=True, default=0)
     cells: tuple[int, ...] = eqx.field(static=True, default=())
+    past_cells: tuple[int, ...] = eqx.field(static=True, default=())
     rounding: Rounding = eqx.field(static=True, default="outward")
 
     @property
@@ -260,6 +262,7 @@ class Carry(eqx.Module):
         believed: no conflict has taken y[k] out of what is believed.
         older: the steps before, as far as rows look back (`observer.past.Past`).
         memory: earlier boxes of the input, where it is known how it moves (`observer.input_memory.InputMemory`).
+        rows: box (c,) of combinations of x[k] that are free of d[k-1], where boxes are cut (`observer.cells`).
     """
 
     state: Interval
@@ -271,6 +274,7 @@ class Carry(eqx.Module):
     believed: Any
     older: Any = ()
     memory: Any = None
+    rows: Interval | None = None
 
 
 class StepOutput(eqx.Module):
