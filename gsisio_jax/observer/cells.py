@@ -39,37 +39,35 @@ def counts(cells: int, bent: np.ndarray) -> tuple[int, ...]:
 
 
 @jax.named_scope("cells")
-def contract(
-    maps: Maps, domain: Domain, z: Interval, rights: list[tuple[Any, Interval]], directions: Affine | None, u: Any
-) -> Domain:
+def contract(maps: Maps, domain: Domain, z: Interval, right: Interval, directions: Affine | None, u: Any) -> Domain:
     """Contract on the cells of the box; a box that is infinite along a state is not cut there.
 
     Args:
         maps: of the observer.
         domain: of x[k] so far.
         z: box (q,) of T2 (y - D u - v).
-        rights: gains N_z (K, n, q) with right sides (K, n) of ``x + N_z psi(x)``.
+        right: right sides of (*) without psi, (K, n).
         directions: those of ``domain.rows``, or None.
         u: known input now.
     """
     free, remainder = maps.free, maps.remainder  # made once: they are kept
-    N_z = jnp.concatenate([of for of, _ in rights])
-    right = Interval.unchecked(*(jnp.concatenate([getattr(b, side) for _, b in rights]) for side in ("lower", "upper")))
+    N_z = maps.observer.gains.remainder
 
-    def one(lower: Any, upper: Any) -> tuple[Any, Any, Any, Any]:
+    def one(lower: Any, upper: Any) -> tuple[Any, Any, Any]:
         cell = Interval.unchecked(lower, upper)
         states = maps.states(cell)
         atoms = maps.free_bounds(states, cell, u)
-        cell, slack = contracted(states, affine_rows(free, states, atoms), z, cell)
-        if directions is not None:
-            cell, more = contracted(maps.states(cell), directions, domain.rows, cell)
-            slack = jnp.concatenate([slack, more])
         solved, _ = solve_remainder(N_z, right, affine_rows(remainder, states, atoms), states, maps.terms)
-        return *_met(cell, solved), slack
+        cell, slack, room = contracted(states, affine_rows(free, states, atoms), z, cell)
+        slack, least = jnp.minimum(slack, room.min()), room.min()
+        if directions is not None:
+            cell, *more = contracted(maps.states(cell), directions, domain.rows, cell)
+            least = jnp.minimum(least, jnp.concatenate(more).min())
+        cell, room = _met(cell, solved)
+        return cell, slack, jnp.minimum(room, least)
 
     def turn(box: Interval, _: Any) -> tuple[Interval, Any]:
-        lower, upper = cut_up(box, maps.observer.cells)
-        cells, room, slack = jax.vmap(one)(lower, upper)
+        cells, slack, room = jax.vmap(one)(*cut_up(box, maps.observer.cells))
         least = jnp.minimum(slack.min(-1, initial=jnp.inf), room.min(-1))
         left, some = hull(cells, ~(least < -domain.tolerance))
         # Where all contradict something, the box stays what it is; what the best of them misses is noted.
@@ -80,11 +78,11 @@ def contract(
     return domain.record_margin(slack[-1], Source.OUTPUT).record_margin(room[-1], Source.STATE).with_box(box)
 
 
-def contracted(states: States, form: Affine, z: Interval, cell: Interval) -> tuple[Interval, Any]:
-    """A cell contracted with ``m(x) in z``, never crossed; and slacks: of the rows, and of their boxes."""
+def contracted(states: States, form: Affine, z: Interval, cell: Interval) -> tuple[Interval, Any, Any]:
+    """A cell contracted with ``m(x) in z``, never crossed; the slack of every row, and the room along every state."""
     rows, slack = contract_affine_rows(states, form, z)
     met, room = _met(cell, rows)
-    return met, jnp.concatenate([slack, room])
+    return met, slack, room
 
 
 def _met(cell: Interval, boxes: Interval) -> tuple[Interval, Any]:

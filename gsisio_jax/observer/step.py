@@ -136,9 +136,8 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
     if observer.past_cells:
         domain, right, d_fixed = past_cells.contract(maps, domain, carry, known, lost, right, d_fixed)
     if observer.cells:
-        rights = [(observer.gains.remainder, plainly_wider(right, lost.radius(constants.gains, domain.box)))]
-        rights.extend(past_cells.solved(maps, domain, known, lost.magnitudes(domain.box)[0]))
-        domain = cells.contract(maps, domain, known.z, rights, past_cells.directions(observer), u)
+        loose = plainly_wider(right, lost.radius(constants.gains, domain.box))
+        domain = cells.contract(maps, domain, known.z, loose, past_cells.directions(observer), u)
     with _stage("initial"):
         # What the gains leave of x[k] and d[k-1]: smaller boxes to come can only make it smaller.
         left = [lost.radius(of, domain.box) for of in (constants.gains, constants.inverses)]
