@@ -3,7 +3,7 @@
 The plants of `benchmarks.tightness`, the spring under Euler (with a delay), the paper's example (S1), six tanks (S5).
 Every setting is run on the same records; widths are means over the second half, relative to one step with one gain
 (state by state: the median and the narrowest). Times are CPU times of one compiled program, all settings in turns;
-operations are those of a step over single numbers (with cells: those that XLA counts).
+operations are the numbers that a step computes, as it is traced.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ import jax
 import numpy as np
 
 import gsisio_jax as gx
-from benchmarks.plants import case, from_tests, records
+from benchmarks.cells import operations
+from benchmarks.plants import case, records
 from benchmarks.tightness import PLANTS, Plant
+from gsisio_jax.observer.step import blank
 
 SETTINGS: tuple[dict[str, Any], ...] = (
     {"window": 1}, {"window": 1, "gains": "auto"}, {}, {"window": 3}, {"gains": "auto"},
@@ -73,9 +75,7 @@ TASKS: dict[str, Callable[[], Task]] = {
 
 def main(names: list[str]) -> int:
     jax.config.update("jax_enable_x64", True)
-    print(
-        "| Plant | asked | window, rows, gains | width: median, narrowest | operations | CPU time of a step | design s |"
-    )
+    print("| Plant | asked | window, rows, gains | width: median, narrowest | operations | CPU time | design s |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name in names or TASKS:
         for line in measured(TASKS[name]()):
@@ -121,16 +121,9 @@ def _sizes(observer: Any) -> tuple[int, ...]:
 def _operations(observer: Any, task: Task) -> int:
     """Of one step; of a delayed observer, that of the lifted plant."""
     inner = getattr(observer, "inner", observer)
-    sizes = from_tests("sizes")
     box = jax.tree.map(lambda side: jax.numpy.asarray(side[0]), task.initial)
-    noise = jax.tree.map(jax.numpy.asarray, inner.noise)
     u = jax.numpy.zeros(inner.system.m) if task.u is None else jax.numpy.asarray(task.u[0])
-    args = sizes.blank(inner, box), jax.numpy.zeros(inner.system.l), u, noise
-    if not inner.cells:
-        return sum(sizes.step_program(inner, args).count().values())
-    step = jax.jit(lambda carry, y: gx.step(inner, carry, y))
-    found = step.lower(args[0], args[1]).compile().cost_analysis()
-    return int((found[0] if isinstance(found, list) else found)["flops"])
+    return operations(inner, blank(inner, box), jax.numpy.zeros(inner.system.l), u)
 
 
 def _in_turns(runs: list[Any], task: Task) -> list[float]:
