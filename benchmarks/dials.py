@@ -101,12 +101,12 @@ def measured(task: Task) -> list[str]:
     times = _in_turns([run for *_, run, _ in found.values()], task)
     base = next(iter(found.values()))[-1]
     lines = []
-    for (sizes, (said, design, operations, _, width)), seconds in zip(found.items(), times, strict=True):
+    for (sizes, (said, design, count, _, width)), seconds in zip(found.items(), times, strict=True):
         both = np.isinf(width) & np.isinf(base)  # a last row that a delay leaves open
         share = np.where(both, 1.0, width / np.where(both, 1.0, base))
         lines.append(
             f"{said} | {', '.join(map(str, sizes[:3]))} | {np.median(share):.3f}, {share.min():.3f} | "
-            f"{operations:,} | {seconds / times[0]:.2f} | {design:.1f} |"
+            f"{count:,} | {seconds / times[0]:.2f} | {design:.1f} |"
         )
     return lines
 
