@@ -60,7 +60,7 @@ def contract(maps: Maps, domain: Domain, z: Interval, right: Interval, direction
         solved, _ = solve_remainder(N_z, right, affine_rows(remainder, states, atoms), states, maps.terms)
         cell, slack, room = contracted(states, affine_rows(free, states, atoms), z, cell)
         slack, least = jnp.minimum(slack, room.min()), room.min()
-        if directions is not None:
+        if directions is not None and domain.rows is not None:
             cell, *more = contracted(maps.states(cell), directions, domain.rows, cell)
             least = jnp.minimum(least, jnp.concatenate(more).min())
         cell, room = _met(cell, solved)

@@ -76,7 +76,8 @@ class FreeRows(NamedTuple):
             a, b = box.lower[first], box.upper[first]
             for i in others:
                 a, b = raised(a, box.lower[i]), cut(b, box.upper[i])
-            low.append(a), high.append(b)
+            low.append(a)
+            high.append(b)
         a, b = jnp.stack(low), jnp.stack(high)
         return Interval.unchecked(smaller(a, b), larger(a, b)), b - a
 
