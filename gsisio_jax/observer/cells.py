@@ -39,7 +39,9 @@ def counts(cells: int, bent: np.ndarray) -> tuple[int, ...]:
 
 
 @jax.named_scope("cells")
-def contract(maps: Maps, domain: Domain, z: Interval, right: Interval, directions: Affine | None, u: Any) -> Domain:
+def contract(
+    maps: Maps, domain: Domain, z: Interval, right: Interval, free_rows: tuple[Affine, Interval] | None, u: Any
+) -> Domain:
     """Contract on the cells of the box; a box that is infinite along a state is not cut there.
 
     Args:
@@ -47,7 +49,7 @@ def contract(maps: Maps, domain: Domain, z: Interval, right: Interval, direction
         domain: of x[k] so far.
         z: box (q,) of T2 (y - D u - v).
         right: right sides of (*) without psi, (K, n).
-        directions: those of ``domain.rows``, or None.
+        free_rows: rows of x[k] with their boxes (`past_cells`), or None.
         u: known input now.
     """
     free, remainder = maps.free, maps.remainder  # made once: they are kept
@@ -60,8 +62,8 @@ def contract(maps: Maps, domain: Domain, z: Interval, right: Interval, direction
         solved, _ = solve_remainder(N_z, right, affine_rows(remainder, states, atoms), states, maps.terms)
         cell, slack, room = contracted(states, affine_rows(free, states, atoms), z, cell)
         slack, least = jnp.minimum(slack, room.min()), room.min()
-        if directions is not None and domain.rows is not None:
-            cell, *more = contracted(maps.states(cell), directions, domain.rows, cell)
+        if free_rows is not None:
+            cell, *more = contracted(maps.states(cell), *free_rows, cell)
             least = jnp.minimum(least, jnp.concatenate(more).min())
         cell, room = _met(cell, solved)
         return cell, slack, jnp.minimum(room, least)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -28,7 +27,6 @@ class Domain(eqx.Module):
         margin: signed slack of the first intersection that was empty (its largest gap), else the smallest slack; None
             as long as there was no intersection.
         source: which piece that was, ``Source * SOURCE_STRIDE + index``.
-        rows: box (c,) of further combinations of the same vector (`observer.cells`), or None.
     """
 
     box: Interval
@@ -36,7 +34,6 @@ class Domain(eqx.Module):
     gap: Any
     margin: Any
     source: Any
-    rows: Interval | None = None
 
     @classmethod
     def of(cls, box: Interval, size: Any) -> Domain:
@@ -45,10 +42,7 @@ class Domain(eqx.Module):
         return cls(box, _ROUNDING * float(jnp.finfo(box.dtype).eps) * size, none, None, None)
 
     def with_box(self, box: Interval) -> Domain:
-        return replace(self, box=box)
-
-    def with_rows(self, rows: Interval) -> Domain:
-        return replace(self, rows=rows)
+        return Domain(box, self.tolerance, self.gap, self.margin, self.source)
 
     def record_margin(self, slack: Any, kind: Source) -> Domain:
         """Note the slacks (k,) of an intersection that leaves the box as it is; NaN (it overflowed) says nothing."""
@@ -68,10 +62,10 @@ class Domain(eqx.Module):
 
     def _noted(self, margin: Any, source: Any, gap: Any) -> Domain:
         if self.margin is None:
-            return replace(self, gap=gap, margin=margin, source=source)
+            return Domain(self.box, self.tolerance, gap, margin, source)
         new = (margin < self.margin) & ~(self.margin < -self.tolerance)
         margin, source = jnp.where(new, margin, self.margin), jnp.where(new, source, self.source)
-        return replace(self, gap=gap, margin=margin, source=source)
+        return Domain(self.box, self.tolerance, gap, margin, source)
 
     def intersect(self, others: Interval | None, kind: Source, quiet: Interval | None = None) -> Domain:
         """Intersect the box with stacks (k, n) of boxes of the same vector, all at once.
@@ -104,7 +98,7 @@ class Domain(eqx.Module):
         gap = self.gap
         for i in range(width.shape[0]):
             gap = cut(gap, width[i])
-        return replace(noted, box=met, gap=gap)
+        return Domain(met, self.tolerance, gap, noted.margin, noted.source)
 
     @property
     def conflict(self) -> Any:

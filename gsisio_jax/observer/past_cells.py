@@ -1,10 +1,9 @@
 """The box of x[k-1] in parts: what its corners, in which no state lies that agrees with y[k-1], add to that of x[k].
 
-The box is cut into cells, each is contracted with the outputs of step k-1 and with what was known of it besides its
-box, and those that contradict them are dropped. f and g are bounded on what is left, cell by cell. So the right side of
-(*) and the bounds of d[k-1] are hulls over cells, and so are the boxes of `FreeRows`: rows of one direction share the
-noise of a cell, and meet there before the hull is taken. These boxes stay in the carry, for a box of x[k] forgets them
-(theory 5.4).
+The box is cut into cells, each is contracted with the outputs of step k-1, and those that contradict them are dropped.
+f and g are bounded on what is left, cell by cell. So the right side of (*) and the bounds of d[k-1] are hulls over
+cells, and so are the boxes of `FreeRows`: rows of one direction share the noise of a cell, and meet there before the
+hull is taken (theory 5.4).
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.interval.box import Interval, choose, entire_like, is_concrete
+from gsisio_jax.interval.box import Interval, choose, is_concrete
 from gsisio_jax.interval.image import loose_matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.observer.bank import Known
@@ -26,14 +25,14 @@ from gsisio_jax.observer.free_rows import FreeRows
 from gsisio_jax.observer.lost import Lost, plainly_wider
 from gsisio_jax.observer.maps import Maps
 from gsisio_jax.observer.measurement import everything_unless, output_box
-from gsisio_jax.observer.types import Carry, Observer
+from gsisio_jax.observer.types import Carry
 
 
 @jax.named_scope("cells")
 def contract(
     maps: Maps, domain: Domain, carry: Carry, known: Known, lost: Lost, right: Interval, d_fixed: Interval
-) -> tuple[Domain, Interval, Interval]:
-    """Cut the box of x[k-1], drop the cells that contradict what was known of it, and bound what is left.
+) -> tuple[Interval, Interval, tuple[Affine, Interval] | None]:
+    """Cut the box of x[k-1], drop the cells that contradict y[k-1], and bound what is left.
 
     At the start, and where no cell is left, nothing changes.
 
@@ -47,7 +46,7 @@ def contract(
         d_fixed: bounds of d[k-1] but for x[k] (K, p), likewise.
 
     Returns:
-        The domain, with the boxes of the directions of `FreeRows`, and the other two, narrowed.
+        The latter two, narrowed; and the directions of `FreeRows` with their boxes, if there are any.
     """
     observer, free = maps.observer, FreeRows.of(maps.observer)
     system, banks = observer.system, (observer.gains.residual, observer.inverses.residual)
@@ -67,9 +66,6 @@ def contract(
         states = maps.states(cell)
         form = affine_rows(outputs, states, maps.bounds(states, cell, carry.u))
         cell, *slack = contracted(states, form, z, cell)
-        if along is not None and carry.rows is not None:
-            cell, *more = contracted(maps.states(cell), along, carry.rows, cell)
-            slack += more
         states = maps.states(cell)
         found = rows.bounds(states, maps.bounds(states, cell, carry.u))
         found = Interval.unchecked(found.lower + added.lower, found.upper + added.upper)
@@ -83,7 +79,8 @@ def contract(
     left, some = hull(boxes, ~(slack < -domain.tolerance).any(-1))
     left = everything_unless(some, left)
     first = right.lower.size
-    return domain.with_rows(left[count:]), _narrowed(right, left[:first]), _narrowed(d_fixed, left[first:count])
+    free_rows = None if along is None else (along, left[count:])
+    return _narrowed(right, left[:first]), _narrowed(d_fixed, left[first:count]), free_rows
 
 
 def _balance(free: FreeRows, domain: Domain, known: Known, lost: Lost) -> Interval:
@@ -110,25 +107,3 @@ def _narrowed(whole: Interval, parts: Interval) -> Interval:
     shape = whole.lower.shape
     lower, upper = raised(whole.lower, parts.lower.reshape(shape)), cut(whole.upper, parts.upper.reshape(shape))
     return choose(lower <= upper, Interval.unchecked(lower, upper), whole)
-
-
-def directions(observer: Observer) -> Affine | None:
-    """Those of ``Domain.rows``; None where there are none."""
-    return FreeRows.of(observer).linear() if observer.past_cells else None
-
-
-def unknown(observer: Observer, dtype: Any) -> Interval | None:
-    """`Carry.rows` of which nothing is known."""
-    if not observer.past_cells:
-        return None
-    return entire_like(jnp.zeros(len(FreeRows.of(observer).directions), dtype))
-
-
-def after(observer: Observer, domain: Domain, carry: Carry) -> Interval | None:
-    """`Carry.rows` for the next step. After a conflict nothing is known of them; nor where a periodic state may have
-    been moved by its period."""
-    if carry.rows is None:
-        return None
-    if domain.rows is None or observer.system.periodic_states:
-        return entire_like(carry.rows)
-    return everything_unless(~domain.conflict, domain.rows)

@@ -47,8 +47,7 @@ def blank(observer: Observer, initial: Interval) -> Carry:
     h = AtomBounds(jnp.zeros((atoms, n), dtype), zero, zero + jnp.inf, entire, *values)
     yes, no = jnp.asarray(True), jnp.asarray(False)
     carry = Carry(initial, h, jnp.full(l, jnp.nan, dtype), jnp.zeros(m, dtype), noise, yes, no)
-    memory, rows = input_memory.blank(observer, dtype), past_cells.unknown(observer, dtype)
-    return replace(carry, older=before_all(carry, observer), memory=memory, rows=rows)
+    return replace(carry, older=before_all(carry, observer), memory=input_memory.blank(observer, dtype))
 
 
 @rounding.by_observer
@@ -134,10 +133,10 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         lost = Lost(observer, d_fixed)
         domain = initial_boxes(maps, domain, right, lost.inputs, u)
     if observer.past_cells:
-        domain, right, d_fixed = past_cells.contract(maps, domain, carry, known, lost, right, d_fixed)
+        right, d_fixed, free = past_cells.contract(maps, domain, carry, known, lost, right, d_fixed)
     if observer.cells:
         loose = plainly_wider(right, lost.radius(constants.gains, domain.box))
-        domain = cells.contract(maps, domain, known.z, loose, past_cells.directions(observer), u)
+        domain = cells.contract(maps, domain, known.z, loose, free, u)
     with _stage("initial"):
         # What the gains leave of x[k] and d[k-1]: smaller boxes to come can only make it smaller.
         left = [lost.radius(of, domain.box) for of in (constants.gains, constants.inverses)]
@@ -243,8 +242,7 @@ def _finish(
     )
     older = shifted(carry, observer, d, conflict & fallback.conflict if hold else conflict)
     memory = input_memory.after(observer, carry, d, conflict, hold)
-    rows = past_cells.after(observer, domain, carry)
-    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed, older, memory, rows)
+    after = Carry(state, h, y, u, noise, jnp.asarray(False), believed, older, memory)
     return after, StepOutput(state, d, d_now, bit_mask(bits), *domain.report())
 
 

@@ -262,7 +262,6 @@ class Carry(eqx.Module):
         believed: no conflict has taken y[k] out of what is believed.
         older: the steps before, as far as rows look back (`observer.past.Past`).
         memory: earlier boxes of the input, where it is known how it moves (`observer.input_memory.InputMemory`).
-        rows: box (c,) of combinations of x[k] that are free of d[k-1], where boxes are cut (`observer.cells`).
     """
 
     state: Interval
@@ -274,7 +273,6 @@ class Carry(eqx.Module):
     believed: Any
     older: Any = ()
     memory: Any = None
-    rows: Interval | None = None
 
 
 class StepOutput(eqx.Module):
