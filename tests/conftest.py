@@ -16,6 +16,12 @@ LONGEST = ("test_containment.py", "test_tune_linear.py", "test_gradients.py", "t
            "test_methods.py", "test_conflicts.py", "test_tune_scale.py")  # fmt: skip
 
 
+def pytest_collection_finish() -> None:
+    """What is imported lives on: no collection need look at it."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.name not in LONGEST)
 

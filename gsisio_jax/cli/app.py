@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .._collector import rare_collection
 from .._extras import MissingExtra, need
 from .._quiet import hear_interrupts
 from ..scalar.options import use_flags
@@ -32,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     use_flags()
     try:
-        code = options.command(options)
+        with rare_collection():
+            code = options.command(options)
         sys.stdout.flush()
         return code
     except BrokenPipeError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal, overload
 
+from gsisio_jax._collector import rare_collection
 from gsisio_jax.design.arguments import check_cells, checked
 from gsisio_jax.design.current import Dials, design_current
 from gsisio_jax.design.delay import check_delay, design_delayed
@@ -206,7 +207,7 @@ def design_observer(
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS
     methods = check_methods("design_observer", default if bounds is None else bounds)
     dials = Dials(gains, missing, sweeps, methods, certify, window, cells, split, tolerate)
-    with told("design_observer", progress) as say:
+    with rare_collection(), told("design_observer", progress) as say:
         if form == "prediction":
             return design_prediction(
                 system, noise, given, u_region, methods, left_inverse, allow_uncertified, derivative, near

@@ -13,6 +13,7 @@ from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type, is_whole, read_array
 from gsisio_jax.plant.periodic import wrapped_outputs
 from gsisio_jax.plant.system import Noise, System
+from gsisio_jax.scalar import in_tasks
 
 
 class Simulation(NamedTuple):
@@ -117,7 +118,7 @@ def _simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any) -
         return x_next, (x, y, w, v)
 
     drawn = (draw(key_w, bounds_w), draw(key_v, bounds_v))
-    last, (x, y, w, v) = jax.lax.scan(step, x0, (d, u, *drawn, bounds_w, bounds_v))
+    last, (x, y, w, v) = jax.lax.scan(in_tasks(step), x0, (d, u, *drawn, bounds_w, bounds_v))
     return Simulation(jnp.concatenate([x, last[None]]), y, w, v)
 
 

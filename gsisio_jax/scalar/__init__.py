@@ -17,6 +17,6 @@ No simplification changes a bit of the result, but for the sign of a zero.
 """
 
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
-from gsisio_jax.scalar.scan import call, in_tasks, scan
+from gsisio_jax.scalar.scan import call, in_tasks, most_numbers, scan
 
-__all__ = ["ScalarProgram", "call", "in_tasks", "scalar_program", "scan"]
+__all__ = ["ScalarProgram", "call", "in_tasks", "most_numbers", "scalar_program", "scan"]

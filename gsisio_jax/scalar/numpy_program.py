@@ -14,6 +14,7 @@ import jax
 import jax.extend.core as jex
 import numpy as np
 
+from gsisio_jax._collector import rare_collection
 from gsisio_jax.scalar.unroll import called_jaxpr
 
 _CALLS = {
@@ -22,6 +23,7 @@ _CALLS = {
 }  # fmt: skip
 
 
+@rare_collection()
 def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[..., Any]:
     """`function` of pytrees of arrays, traced once for the shapes and types of `example`.
 

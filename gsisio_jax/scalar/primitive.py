@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
 
+from gsisio_jax._collector import rare_collection
 from gsisio_jax.scalar.derivative import Mask, cotangent_program, reached, tangent_program
 from gsisio_jax.scalar.program import ScalarProgram
 
@@ -65,6 +66,7 @@ def _types(args: Sequence[Any], program: ScalarProgram, levels: Levels) -> list[
     return types
 
 
+@rare_collection()
 def _lowered(*args: Any, program: ScalarProgram, levels: Levels) -> Any:
     return _function(program, levels)(*args)
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 
+from gsisio_jax._collector import rare_collection
 from gsisio_jax.scalar.options import XLA_LOOP_BYTES, loop_bytes
 from gsisio_jax.scalar.primitive import run
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
@@ -22,7 +23,25 @@ Measured over single numbers and over arrays (two cores shared with other work, 
 74,000 a first call of 17 and 10 s, .62 and 6.8 microseconds a step and box; at 88,000 23 and 10 s, .76 and 8.7; at
 136,000 39 and 9 s, 2.1 and 11.5."""
 
+MOST_OF_LONG_RUNS = 250_000
+"""The same where so many steps are computed that the seconds of compiling do not count."""
+
+LONG_RUN = 10**7
+"""Steps of all cases together from which `MOST_OF_LONG_RUNS` holds.
+
+Measured with 168,000 numbers (eight states, three inputs, a window of five; CPU time of a sweep): over arrays 15
+microseconds a step, over numbers 3.6 and 33 s more to compile, in 2.0 GB for .9. That is won back after 3 million."""
+
 _SHAPES = 32  # of kept numbers; NumPy allows 64 axes
+
+
+def most_numbers(steps: float) -> int:
+    """Numbers that a body may compute, for so many steps of all cases together.
+
+    >>> most_numbers(1e3), most_numbers(1e8)
+    (100000, 250000)
+    """
+    return MOST_OF_LONG_RUNS if steps >= LONG_RUN else MOST_NUMBERS
 
 
 def scan(
@@ -31,15 +50,17 @@ def scan(
     xs: Any,
     length: int | None = None,
     wrap: Callable[..., Any] = lambda step: step,
+    most: int | None = None,
 ) -> tuple[Any, Any]:
     """``jax.lax.scan``. Packed and unpacked once, at the edge: between steps every number is a 0-d value, which
     `jax.vmap` makes a vector over the batch. `wrap` is applied to the step (`jax.checkpoint`, say) where it stays one
-    over arrays; over numbers reverse mode keeps nothing but the arguments of a step anyway."""
+    over arrays; over numbers reverse mode keeps nothing but the arguments of a step anyway. `most`: numbers that the
+    body may compute (None: `MOST_NUMBERS`)."""
     rows = jax.tree.leaves(xs)
     turns: int = rows[0].shape[0] if length is None else length
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), xs)
     carry = jax.tree.map(jnp.asarray, carry)
-    traced = _trace(body, carry, one)
+    traced = _trace(body, carry, one, most=most)
     if traced is None:
         return jax.lax.scan(in_tasks(wrap(body)), carry, xs, length=turns)
     program, consts, structure = traced
@@ -82,7 +103,9 @@ def in_tasks(step: Callable[..., Any]) -> Callable[..., Any]:
     def turn(carry: Any, row: Any) -> tuple[Any, Any]:
         carry, out = step(carry, row)
         leaves, structure = jax.tree.flatten(carry)
-        i = next(i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.size)
+        i = next((i for i, leaf in enumerate(leaves) if jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.size), None)
+        if i is None:
+            return carry, out
         number = jax.lax.stop_gradient(leaves[i].ravel()[0])
         low, high = jax.lax.sort(jnp.stack([number, number + 1]))
         leaves[i] = jnp.where(low > high, jnp.nan, leaves[i])  # never, which XLA does not know
@@ -102,10 +125,13 @@ def call(function: Callable[..., Any], *args: Any) -> Any:
     return jax.tree.unflatten(structure, _packed(run(program, [*consts, *numbers]), program.results, ()))
 
 
-def _trace(function: Callable[..., Any], *args: Any) -> tuple[ScalarProgram, list[Any], Any] | None:
+@rare_collection()
+def _trace(
+    function: Callable[..., Any], *args: Any, most: int | None = None
+) -> tuple[ScalarProgram, list[Any], Any] | None:
     """The program, entries of what the function closes over, and the structure of its results; None if too large."""
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*args)
-    if numbers_in(closed.jaxpr) > MOST_NUMBERS:
+    if numbers_in(closed.jaxpr) > (MOST_NUMBERS if most is None else most):
         return None
     moving = [isinstance(const, Tracer) for const in closed.consts]
     program = scalar_program(closed, moving)

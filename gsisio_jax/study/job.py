@@ -13,6 +13,7 @@ from jax.sharding import Mesh
 
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.fixed import Fixed
+from gsisio_jax.scalar import most_numbers
 from gsisio_jax.study import devices
 from gsisio_jax.study.axes import Layout
 from gsisio_jax.study.certified_widths import along, promised
@@ -45,6 +46,7 @@ class Job:
         hold: as in `estimate`, ``on_conflict="hold"``.
         size: cases per tile.
         chunk: cases that a CPU takes at once, the same for all tiles.
+        most: numbers that a step may compute; the same for all tiles.
         shapes: of the results of one case.
         cost: bytes of working set of a case, where the size of a tile was chosen by it.
         mesh: devices that share a tile, from `devices.flat`.
@@ -59,6 +61,7 @@ class Job:
     hold: bool
     size: int
     chunk: int
+    most: int
     shapes: dict[str, jax.ShapeDtypeStruct]
     cost: float | None = None
     mesh: Mesh | None = None
@@ -92,7 +95,8 @@ class Job:
         planned = outline(observer, one, shared, rows, reductions, hold)
         size, chosen = _batch(call, batch, planned.cost, layout.cases), planned.cost if batch is None else None
         chunk, shapes = min(planned.chunk(layout.cases), size), planned.shapes
-        return cls(call, observer, arguments, layout, rows, reductions, hold, size, chunk, shapes, chosen)
+        most = most_numbers(float(planned.turns) * layout.cases)
+        return cls(call, observer, arguments, layout, rows, reductions, hold, size, chunk, most, shapes, chosen)
 
     def on(self, mesh: Any) -> Job:
         """The same study with every tile spread over devices; a chosen tile grows with their number.
@@ -143,7 +147,7 @@ class Job:
         if self.mesh is not None:
             varying = devices.spread(varying, self.mesh)
         observer, shared = self._common
-        return run_cases(observer, varying, shared, self.rows, self.reductions, self.hold)
+        return run_cases(observer, varying, shared, self.rows, self.reductions, self.hold, self.most)
 
     def finish(self, tile: int, running: Running) -> Results:
         """Wait for a tile that was started, and check it.

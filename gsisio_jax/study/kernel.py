@@ -45,6 +45,7 @@ def run_cases(
     rows: Rows,
     reductions: tuple[Reduction, ...],
     hold: bool,
+    most: int,
 ) -> dict[str, Any]:
     """Run the observer on B cases and reduce every run as it goes along.
 
@@ -58,17 +59,18 @@ def run_cases(
         rows: what the observer is given at every step.
         reductions: from `reductions.resolve`.
         hold: as in `estimate`, ``on_conflict="hold"``.
+        most: numbers that a step may compute (`scalar.most_numbers`).
 
     Returns:
         Arrays (B, ...) by name, not waited for.
     """
-    return compiled()(observer, dict(varying), dict(shared), rows, reductions, hold)
+    return compiled()(observer, dict(varying), dict(shared), rows, reductions, hold, most)
 
 
 @cache
 def compiled() -> Any:
     """The jitted function behind `run_cases`."""
-    return jax.jit(_run, static_argnames=("fixed", "rows", "reductions", "hold"))
+    return jax.jit(_run, static_argnames=("fixed", "rows", "reductions", "hold", "most"))
 
 
 def _run(
@@ -78,12 +80,13 @@ def _run(
     rows: Rows,
     reductions: tuple[Reduction, ...],
     hold: bool,
+    most: int,
 ) -> Any:
-    return jax.vmap(lambda one: _case(fixed.value, eqx.combine(one, shared), rows, reductions, hold))(varying)
+    return jax.vmap(lambda one: _case(fixed.value, eqx.combine(one, shared), rows, reductions, hold, most))(varying)
 
 
 def _case(
-    observer: AnyObserver, case: Any, source: Rows, reductions: tuple[Reduction, ...], hold: bool
+    observer: AnyObserver, case: Any, source: Rows, reductions: tuple[Reduction, ...], hold: bool, most: int
 ) -> dict[str, Any]:
     length, steady, delay = case.get("length"), case["steady"], later.delay_of(observer)
     # The last steps lack measurements where the observer has a delay: their boxes are kept, but do not count.
@@ -123,7 +126,7 @@ def _case(
     running = [None if isinstance(r, Kept) else state for r, state in zip(reductions, states, strict=True)]
     given = later.longer(source, case, delay) if delay else source.given(case)
     steps = jnp.arange(1, source.steps(case) + delay, dtype=jnp.int32), given
-    (_, carried, running, _), kept = scalar.scan(body, (carry, carried, running, truth), steps)
+    (_, carried, running, _), kept = scalar.scan(body, (carry, carried, running, truth), steps, most=most)
     results: dict[str, Any] = {}
     for reduction, start, state, rest in zip(reductions, states, running, kept, strict=True):
         if isinstance(reduction, Kept):

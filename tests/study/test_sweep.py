@@ -344,6 +344,20 @@ def test_reductions_of_ones_own(whole):
     np.testing.assert_array_equal(whole.steps, np.tile(np.arange(T), (11, 1)))
 
 
+def test_a_long_study_computes_larger_programs_over_single_numbers(plain, in_tiles_of_four, monkeypatch):
+    scan = importlib.import_module("gsisio_jax.scalar.scan")
+    run, calls = scan.run, []
+    monkeypatch.setattr(scan, "run", lambda *args: calls.append(1) or run(*args))
+    monkeypatch.setattr(scan, "MOST_NUMBERS", 0)
+    over_arrays = gx.sweep(**plain, batch=4, reduce="final")
+    assert not calls
+    monkeypatch.setattr(scan, "LONG_RUN", 100)  # 11 cases of 15 steps
+    over_numbers = gx.sweep(**plain, batch=4, reduce="final")
+    assert calls
+    for found in (over_arrays, over_numbers):
+        np.testing.assert_allclose(found.state_width_final, in_tiles_of_four.state_width_final, rtol=1e-9)
+
+
 def test_a_store_holds_the_same_study_and_resumes(plain, in_tiles_of_four, tmp_path, monkeypatch):
     pytest.importorskip("zarr")
     stored = gx.sweep(**plain, batch=4, store=tmp_path / "study.zarr")
