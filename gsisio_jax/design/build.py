@@ -166,9 +166,11 @@ def design_observer(
             positions are measured), or to smooth. Outputs, but for those of step k, must be affine in the state, and
             so must be for L >= 2 the parts of f that they see. "auto" takes the smallest L up to n that shows every
             unknown input. The result is a `DelayedObserver`; online its boxes come L steps late.
-        cells: current form: into about how many parts the box of x[k] is cut in every step where outputs are bent, to
-            bound them part by part: 64 finds a position by ranges and bearings in a box as large as the distances,
-            where one part may leave it as wide as the state bounds. 1 takes the box whole.
+        cells: current form: into about how many parts the box of x[k] is cut in every step where outputs are bent, and
+            the last one where f or g is, to bound them part by part: 64 finds a position by ranges and bearings in a
+            box as large as the distances, where one part may leave it as wide as the state bounds; 36 bring the boxes
+            of the paper's example from 5 % to .5 % above the exact hull. A step takes many times as long. 1 takes the
+            boxes whole.
         split: cut every state of the region into so many slices, most where slopes of f and g vary, and count slopes
             slice by slice: boxes nearly as wide as the region then get the width promise that they keep anyway, where
             the largest slope of the region says more, or leaves the certificate empty. Costs operations in proportion.

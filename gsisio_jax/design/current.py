@@ -132,7 +132,11 @@ def design_current(
         weights = np.asarray(observer.gains.residual[0])
         certificate = with_slices(observer.certificate, noise, weights, on.slopes, box, dials.split)
         observer = replace(observer, certificate=certificate)
-    observer = replace(observer, cells=counts(dials.cells, everywhere.bent_outputs))
+    observer = replace(
+        observer,
+        cells=counts(dials.cells, everywhere.bent_outputs),
+        past_cells=counts(dials.cells, everywhere.bent_states),
+    )
     if not (first.uncertified or observer.certificate.certified):
         way = what_settles(plan, on, box)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))

@@ -48,6 +48,12 @@ class Slopes(eqx.Module):
         return np.array([not self.near_affine(column) for column in self.Z_radius.T], bool)
 
     @property
+    def bent_states(self) -> np.ndarray:
+        """(n,): in which states f, g or T2 g is not affine."""
+        radii = np.concatenate([self.F_radius, self.E_radius, self.Z_radius])
+        return np.array([not self.near_affine(column) for column in radii.T], bool)
+
+    @property
     def affine(self) -> bool:
         """f and g are affine there."""
         return self.near_affine(self.F_radius, self.E_radius, self.Z_radius)

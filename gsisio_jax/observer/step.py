@@ -16,7 +16,7 @@ from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, nan_to_unbounded
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
-from gsisio_jax.observer import cells, input_memory, periodic, recovery, restart, window
+from gsisio_jax.observer import cells, input_memory, past_cells, periodic, recovery, restart, window
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
 from gsisio_jax.observer.certified import certified, certified_input
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
@@ -132,8 +132,11 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         domain = _output(domain, maps.states(domain.box), first.on(domain.box), known.z)
         lost = Lost(observer, d_fixed)
         domain = initial_boxes(maps, domain, right, lost.inputs, u)
+    if observer.past_cells:
+        right, d_fixed, free = past_cells.contract(maps, domain, carry, known, lost, right, d_fixed)
     if observer.cells:
-        domain = cells.contract(maps, domain, known.z, u)
+        loose = plainly_wider(right, lost.radius(constants.gains, domain.box))
+        domain = cells.contract(maps, domain, known.z, loose, free, u)
     with _stage("initial"):
         # What the gains leave of x[k] and d[k-1]: smaller boxes to come can only make it smaller.
         left = [lost.radius(of, domain.box) for of in (constants.gains, constants.inverses)]

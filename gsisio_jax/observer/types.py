@@ -133,7 +133,8 @@ class Observer(eqx.Module):
         recovery: rows that need no box to begin with (`observer.recovery.Recovery`), those of one length together.
         input_rows: rows for the unknown input over several steps (`observer.input_memory.InputRows`), or None.
         corrections: Newton steps to the point that the certified bound is around (theory 5.6).
-        cells: into how many parts the box of every state is cut for the outputs (`observer.cells`); () for none.
+        cells: into how many parts the box of x[k] is cut along every state (`observer.cells`); () for none.
+        past_cells: the same of x[k-1].
         rounding: "outward": boxes hold on the machine. "nearest": up to rounding errors, for comparisons of speed.
     """
 
@@ -163,6 +164,7 @@ class Observer(eqx.Module):
     input_rows: Any = None
     corrections: int = eqx.field(static=True, default=0)
     cells: tuple[int, ...] = eqx.field(static=True, default=())
+    past_cells: tuple[int, ...] = eqx.field(static=True, default=())
     rounding: Rounding = eqx.field(static=True, default="outward")
 
     @property
