@@ -144,7 +144,7 @@ def design_current(
         window = 1
     if window != 1:
         say("choosing rows over several steps")
-        rows = window_rows_with_less(problem, window, width, bank)
+        rows = window_rows_with_less(problem, window, width, bank, box)
         observer = replace(observer, window=rows)
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
