@@ -37,7 +37,7 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = "auto",
     delay: Literal[0] = 0,
-    cells: int = 1,
+    cells: int | Literal["auto"] = "auto",
     split: int | Literal["auto"] = 1,
     tolerate: Literal[0] = 0,
     around: Around | None = None,
@@ -60,7 +60,7 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = "auto",
     delay: Literal[0] = 0,
-    cells: int = 1,
+    cells: int | Literal["auto"] = "auto",
     tolerate: int,
 ) -> Observer | TolerantObserver: ...
 
@@ -80,7 +80,7 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = "auto",
     delay: int | Literal["auto"],
-    cells: int = 1,
+    cells: int | Literal["auto"] = "auto",
     split: int | Literal["auto"] = 1,
     around: Around | None = None,
     progress: bool | None = None,
@@ -120,7 +120,7 @@ def design_observer(
     certify: bool = True,
     window: int | Literal["auto"] = "auto",
     delay: int | Literal["auto"] = 0,
-    cells: int = 1,
+    cells: int | Literal["auto"] = "auto",
     split: int | Literal["auto"] = 1,
     tolerate: int = 0,
     around: Around | None = None,
@@ -166,7 +166,9 @@ def design_observer(
             unknown input. The result is a `DelayedObserver`; online its boxes come L steps late.
         cells: current form: into about how many parts the box of x[k] is cut in every step where outputs are bent, to
             bound them part by part: 64 finds a position by ranges and bearings in a box as large as the distances,
-            where one part may leave it as wide as the state bounds. 1 takes the box whole.
+            where one part may leave it as wide as the state bounds. 1 takes the box whole. "auto" takes 64 where an
+            unknown input moves such a state freely, its box would stay wider than a tenth of its bounds, and cells
+            halve it, in runs without noise; the certificate notes it.
         split: cut every state of the region into so many slices, most where slopes of f and g vary, and count slopes
             slice by slice: boxes nearly as wide as the region then get the width promise that they keep anyway, where
             the largest slope of the region says more, or leaves the certificate empty. Costs operations in proportion.
