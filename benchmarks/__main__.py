@@ -57,6 +57,7 @@ def cases(
             for plant in ("s1", "s5")
             for dtype in ("float64", "float32")
         },
+        **{f"piecewise {kind}": ("piecewise", "case", {"kind": kind}) for kind in ("clips", "interp", "battery")},
         **{f"plants {name}": ("gallery", "plant", {"name": name, **size["plants"]}) for name in PLANTS},
         "startup import": ("startup", "importing", {}),
         "startup six tanks": ("startup", "tanks", size["tanks"]),

@@ -90,7 +90,7 @@ class DesignPart(Part):
     sweeps: Annotated[int, Field(ge=1)] | None = None
     window: Count = None
     split: Count = None
-    cells: Annotated[int, Field(ge=1)] | None = None
+    cells: Count = None
     delay: Delay = None
     bounds: Annotated[list[str], Field(min_length=1)] | None = None
     form: Literal["current", "prediction"] | None = None

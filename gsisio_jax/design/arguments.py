@@ -99,10 +99,12 @@ def check_cells(cells: Any, form: str) -> None:
     Raises:
         ValueError: it is not.
     """
-    whole = is_whole(cells)
-    if not whole or not 1 <= cells <= _MOST_CELLS:
+    if isinstance(cells, str) and cells == "auto":
+        return
+    if not is_whole(cells) or not 1 <= cells <= _MOST_CELLS:
         raise ValueError(
-            f"design_observer: `cells` must be a whole number, 1 (the box as a whole) to {_MOST_CELLS}, got {cells!r}"
+            f"design_observer: `cells` must be a whole number, 1 (the box as a whole) to {_MOST_CELLS}, or "
+            f'"auto", got {cells!r}'
         )
     if cells > 1 and form == "prediction":
         raise ValueError(f"design_observer: `cells` must be 1 in the prediction form, which uses no y[k], got {cells}")

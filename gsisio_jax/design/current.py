@@ -9,6 +9,7 @@ import numpy as np
 
 from gsisio_jax.design.anchored import with_anchored_rows
 from gsisio_jax.design.assemble import Plan, assemble
+from gsisio_jax.design.cells import with_cells
 from gsisio_jax.design.dead_beat import dead_beat_rows
 from gsisio_jax.design.delay import with_delay
 from gsisio_jax.design.existence import check_existence
@@ -40,7 +41,6 @@ from gsisio_jax.design.undefined import undefined_in
 from gsisio_jax.design.window_with_less import window_rows_with_less
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer.cells import counts
 from gsisio_jax.observer.enclosures import Enclosures, Slopes
 from gsisio_jax.observer.recovery_constants import AffineMaps
 from gsisio_jax.observer.rounding_constants import with_rounding_constants
@@ -58,7 +58,7 @@ class Dials(NamedTuple):
     methods: tuple[str, ...]
     certify: bool
     window: int | Literal["auto"]
-    cells: int
+    cells: int | Literal["auto"]
     split: int | Literal["auto"]
     tolerate: int
 
@@ -132,11 +132,6 @@ def design_current(
         weights = np.asarray(observer.gains.residual[0])
         certificate = with_slices(observer.certificate, noise, weights, on.slopes, box, dials.split)
         observer = replace(observer, certificate=certificate)
-    observer = replace(
-        observer,
-        cells=counts(dials.cells, everywhere.bent_outputs),
-        past_cells=counts(dials.cells, everywhere.bent_states),
-    )
     if not (first.uncertified or observer.certificate.certified):
         way = what_settles(plan, on, box)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))
@@ -148,7 +143,7 @@ def design_current(
         window = 1
     if window != 1:
         say("choosing rows over several steps")
-        rows = window_rows_with_less(problem, window, width, bank)
+        rows = window_rows_with_less(problem, window, width, bank, box)
         observer = replace(observer, window=rows)
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
@@ -159,6 +154,9 @@ def design_current(
         observer = replace(observer, recovery=rows_alone)
     say("bounding what rounding leaves")
     observer = finished(observer)
+    if dials.cells != 1:
+        say("trying cells")
+    observer = with_cells(observer, problem, dials.cells, everywhere, u_region)
     if dials.certify:
         try:
             check_initial_contraction(problem, bank[0], observer, outputs)

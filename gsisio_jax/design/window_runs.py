@@ -49,9 +49,11 @@ class Runs:
     def __init__(self, problem: GainProblem, length: int, start: np.ndarray, rng: np.random.Generator):
         self.problem, self.length, self.start, self.rng = problem, length, start, rng
 
-    def of(self, rows: Rows, vertices: bool) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """For every step with a whole window: sizes and drifts (S, k) of the parts of a row, and the distances to the
-        lower and the upper side (S, n)."""
+    def of(
+        self, rows: Rows, vertices: bool, from_start: bool = False
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
+        """For every step with a whole window, or from the first one: sizes and drifts (S, k) of the parts of a row, and
+        the distances to the lower and the upper side (S, n)."""
         P, N, n = self.problem, self.length, self.problem.n
         total = N + _STEPS
         w, v = self._noise(P.dw / 2, total, vertices), self._noise(P.dv / 2, total, vertices)
@@ -73,7 +75,7 @@ class Runs:
             sides = measured(P, sides, v[:, k] @ P.T2.T)
             below.append(sides[0])
             above.append(sides[1])
-            if k > N + 3:
+            if from_start or k > N + 3:
                 found.append((size, drift, *sides))
         return found
 

@@ -12,21 +12,22 @@ import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window import deepest_first, window_rows
+from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.window import Window
 
 
 def window_rows_with_less(
-    problem: GainProblem, length: int | str, width: np.ndarray, bank: list[np.ndarray]
+    problem: GainProblem, length: int | str, width: np.ndarray, bank: list[np.ndarray], region: Interval
 ) -> Window | None:
     """As `window_rows`, with what the same search finds without the bounds of states and inputs."""
-    own = window_rows(problem, length, width, bank)
+    own = window_rows(problem, length, width, bank, region)
     if not (len(problem.ds) or len(problem.dd)):
         return own
     everything = np.full(len(problem.free), True)
     free = replace(problem, C=problem.C[: problem.q], ds=np.zeros(0), dd=np.zeros(0), free=everything)
     if np.linalg.matrix_rank(free.seen) < free.seen.shape[1]:
         return own  # there is no observer without the bounds
-    less = window_rows(free, length, width, [N[:, : problem.l + problem.q] for N in bank])
+    less = window_rows(free, length, width, [N[:, : problem.l + problem.q] for N in bank], region)
     return own if less is None else _joined(problem, [less] if own is None else [own, less])
 
 

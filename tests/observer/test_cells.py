@@ -8,6 +8,8 @@ import pytest
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
+from gsisio_jax.design.cells import _moved_freely
+from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.observer.cells import counts
 
 BEACONS = 30 * np.array([[1.0, 0.0], [0.0, 1.0], [-0.8, -0.7]])  # m
@@ -27,8 +29,9 @@ def run():
         lambda x: x, _outputs, G=0.1 * np.eye(2), H=np.zeros((4, 2)), state_bounds=Interval.symmetric([20.0, 20.0])
     )
     noise = gx.Noise(Interval.symmetric([0.002, 0.002]), Interval.symmetric(NOISE))
-    observer = gx.design_observer(system, noise, Interval.symmetric([10.0, 10.0]), missing=False, sweeps=2, cells=64)
-    assert observer.cells == (8, 8)
+    observer = gx.design_observer(system, noise, Interval.symmetric([10.0, 10.0]), missing=False, sweeps=2)
+    assert observer.cells == (8, 8)  # by default: see `with_cells`
+    assert "cells=64, chosen as outputs are bent: the box of state 1 would stay 40 wide" in str(observer.certificate)
     generator = np.random.default_rng(0)
     x = np.array([6.0, -3.0]) + np.cumsum(generator.uniform(-1, 1, (STEPS, 2)), axis=0)
     y = np.array([np.asarray(_outputs(row)) for row in x]) + generator.uniform(-1, 1, (STEPS, 4)) * NOISE
@@ -70,3 +73,23 @@ def test_only_bent_states_are_cut():
     assert counts(64, np.array([True, True, True])) == (4, 4, 4)
     assert counts(1, np.array([True])) == ()
     assert counts(64, np.array([False, False])) == ()
+
+
+def test_a_choice_is_only_tried_where_nothing_but_the_outputs_of_the_step_says_where_a_state_is():
+    none = np.zeros(0)
+
+    def problem(G, H, free):
+        two, T2 = np.eye(2), np.eye(len(H))
+        zero = np.zeros((len(H), 2))
+        return GainProblem(two, 0 * two, zero, zero, T2, zero, zero, G, H, free, none, none, none, none)
+
+    G, bounded = np.array([[0.1], [0.0]]), np.array([False])
+    assert _moved_freely(problem(G, np.zeros((1, 1)), ~bounded)).tolist() == [True, False]
+    assert not _moved_freely(problem(G, np.ones((1, 1)), ~bounded)).any()  # it shows at once
+    assert not _moved_freely(problem(G, np.zeros((1, 1)), bounded)).any()
+
+
+def test_affine_outputs_are_not_cut():
+    system = gx.System(lambda x: x, lambda x: x, G=[[0.1]], H=[[0.0]], state_bounds=Interval([-20.0], [20.0]))
+    noise = gx.Noise(Interval.symmetric([0.01]), Interval.symmetric([0.1]))
+    assert gx.design_observer(system, noise, Interval([-1.0], [1.0]), missing=False, window=1).cells == ()

@@ -58,3 +58,12 @@ def test_true_bounds_never_widen_a_box(name):
     without, y = widths(make, {})
     with_bounds, _ = widths(make, known, y)
     assert (with_bounds[-20:] <= without[-20:] * (1 + 1e-6)).all()
+
+
+def test_rows_for_the_first_steps_close_the_room_that_nobody_measures():
+    """With four sensors boxes settle as soon as with rows over several steps; from the region's width they do not."""
+    example = gx.examples.load("building")
+    options = {"u_region": example.u_region, "missing": False, "certify": False}
+    observer = gx.design_observer(example.system, example.noise, example.region, **options)
+    assert observer.window is not None
+    assert set(observer.window.targets) == {2}

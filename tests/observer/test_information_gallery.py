@@ -13,11 +13,15 @@ from information import KINDS, Plant, excess
 import gsisio_jax as gx
 
 ROUNDING = 1e-6
-# Share by which some width is larger at some step with more known, as measured.
+# Share by which some width is larger at some step with more known, as measured, and why.
 LEFT = {
-    ("paper", "state bounds"): 1e-3,
-    ("paper", "input bounds"): 5e-3,
-    ("unicycle", "initial box"): 2e-5,
+    # The form of a bent output on state bounds has another slope than that on all states: at k = 0; later 6e-4.
+    ("paper", "state bounds"): 2.1e-2,
+    # Boxes of f and g on a smaller box need not lie in those on a larger one.
+    ("paper", "input bounds"): 3e-4,
+    # Rows over several steps are chosen on simulated runs, and other widths give other rows.
+    ("quadruple_tank", "input bounds"): 4.2e-3,
+    ("building", "output"): 1.7e-2,
 }
 CHEAP = ("sir",)  # more of them would take too long for a default run
 
