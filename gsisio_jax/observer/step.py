@@ -132,11 +132,12 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         domain = _output(domain, maps.states(domain.box), first.on(domain.box), known.z)
         lost = Lost(observer, d_fixed)
         domain = initial_boxes(maps, domain, right, lost.inputs, u)
+    free_rows = None
     if observer.past_cells:
-        right, d_fixed, free = past_cells.contract(maps, domain, carry, known, lost, right, d_fixed)
+        right, d_fixed, free_rows = past_cells.contract(maps, domain, carry, known, lost, right, d_fixed)
     if observer.cells:
         loose = plainly_wider(right, lost.radius(constants.gains, domain.box))
-        domain = cells.contract(maps, domain, known.z, loose, free, u)
+        domain = cells.contract(maps, domain, known.z, loose, free_rows, u)
     with _stage("initial"):
         # What the gains leave of x[k] and d[k-1]: smaller boxes to come can only make it smaller.
         left = [lost.radius(of, domain.box) for of in (constants.gains, constants.inverses)]
