@@ -43,6 +43,14 @@ def test_the_tank_has_a_certificate_that_is_not_empty(tank, observer):
     np.testing.assert_allclose(width, found.steady_width, rtol=1e-6)
 
 
+def test_the_unicycle_has_one_on_its_whole_arena():
+    """Positions are no wider than the arena, and the heading is then known to 2.29 rad, whatever it was before."""
+    arena = Interval([-6.0, -5.0, -1.2], [4.0, 6.0, 1.2])
+    found = replace(systems.s9(), region=arena).design(missing=False, window=1, split=4).certificate
+    assert found.self_consistent
+    np.testing.assert_allclose(found.steady_width, [10.0, 11.0, 2.29124], rtol=1e-5)
+
+
 def test_no_box_of_the_region_gets_wider_than_promised(tank, observer):
     """Boxes of every size, one step; the promise is nearly reached. The first measurement says nothing of the levels 2,
     measured with a bias, 3 and 4."""
