@@ -1,7 +1,9 @@
 """The reference results are double precision; float32 is tested by float32 inputs."""
 
 import gc
+from collections import Counter
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import pytest
@@ -24,6 +26,18 @@ def pytest_collection_finish() -> None:
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Where the time went: `LONGEST` and the aim of the gate's time need it."""
+    seconds: Counter[str] = Counter()
+    for report in (report for reports in terminalreporter.stats.values() for report in reports):
+        if hasattr(report, "duration"):
+            seconds[report.nodeid.partition("::")[0]] += report.duration
+    if sum(seconds.values()) > 60:
+        terminalreporter.section(f"modules of {sum(seconds.values()):.0f} s in all")
+        for name, spent in seconds.most_common(30):
+            terminalreporter.line(f"{spent:7.1f} s  {name}")
 
 
 @pytest.fixture(scope="module", autouse=True)
