@@ -55,7 +55,7 @@ def test_only_many_conflicts_raise_the_question_of_units(conflicts, steps, said)
 def test_the_summary_of_an_estimate():
     state = Interval(np.array([[-2.0], [-1.0], [-0.5]]), np.array([[0.0], [1.0], [0.5]]))
     status = np.array([Status.OUTSIDE_REGION, Status.OUTSIDE_REGION | Status.MISSING, Status.OUTSIDE_REGION])
-    est = SimpleNamespace(status=status, state=state)
+    est = SimpleNamespace(status=status, state=state, kept=None)
     certificate = SimpleNamespace(region=Interval([-1.0], [1.0]), self_consistent=True, certified=True)
     observer = SimpleNamespace(certificate=certificate, u_region=Interval([0.0], [1.0]))
     assert where(est) == Outside(3, 3)
