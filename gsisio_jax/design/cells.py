@@ -28,8 +28,8 @@ def with_cells(
         observer: a finished one without cells.
         problem: of the design.
         cells: about how many, of the box of x[k] and of the last one; "auto" takes 64 of the first where boxes of
-            states that outputs are bent in would else stay nearly as wide as their bounds, in a noise-free run from
-            these, and cells halve them.
+            states that outputs are bent in would else become nearly as wide as their bounds, in a noise-free run from
+            a narrow box, and cells halve them.
         everywhere: bounds of the maps of the plant.
         u_region: of the design.
     """
@@ -65,8 +65,12 @@ def _moved_freely(problem: GainProblem) -> np.ndarray:
 
 
 def _widths(observer: Observer, u_region: Interval) -> np.ndarray | None:
-    """Median widths (n,) of the last boxes of a run without noise that begins with the state bounds."""
+    """Median widths (n,) of the last boxes of a run without noise that begins with a narrow box: half as wide as is
+    promised, or as the region."""
     trial = Trial.of(observer, u_region)
     if trial is None:
         return None
-    return np.median(trial.widths(observer.system.state_bounds, trial.rows)[-_SETTLED:], axis=0)
+    certificate, bounds = observer.certificate, observer.system.state_bounds
+    reach = np.minimum(certificate.region.width, certificate.steady_width) / 4
+    lower, upper = np.maximum(trial.start - reach, bounds.lower), np.minimum(trial.start + reach, bounds.upper)
+    return np.median(trial.widths(Interval(lower, upper), trial.rows)[-_SETTLED:], axis=0)

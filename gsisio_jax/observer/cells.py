@@ -106,7 +106,7 @@ def cut_up(box: Interval, parts: tuple[int, ...]) -> tuple[Any, Any]:
 def _edges(lower: Any, upper: Any, count: int) -> Any:
     """Edges of the cells along one state, increasing; the ends are those of the box. The first cell of an infinite
     box is all of it, and so are the others."""
-    share = np.arange(1, count) / count
+    share = (np.arange(1, count) / count).astype(lower.dtype)
     inner = jnp.clip(lower + (upper - lower) * share, lower, upper)
     return jnp.concatenate([lower[None], inner, upper[None]])
 

@@ -77,7 +77,9 @@ def _run(case: systems.Case, holes: list[Any], push: Any = 0.0, rounding: Any = 
 @pytest.fixture(scope="module")
 def paper():
     """The paper's example with state bounds; row 14 contradicts even those."""
-    return _run(paper_with_bounds(), [5, (9, 0)], push=np.array([10.0, 40.0]), rounding="nearest", missing=False)
+    return _run(
+        paper_with_bounds(), [5, (9, 0)], push=np.array([10.0, 40.0]), rounding="nearest", missing=False, cells=1
+    )
 
 
 @pytest.fixture(scope="module")
