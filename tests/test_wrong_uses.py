@@ -232,13 +232,13 @@ SWAPPED = {
     "delay tuned": (
         lambda o: gx.tune_noise(o.delayed, o.records),
         "tune_noise: `observer`",
-        "without a delay",
+        "without `delay`",
         "DelayedObserver",
     ),
     "delay in a gradient": (
         lambda o: gx.width_sensitivity(o.delayed, BOX, Y),
         "width_sensitivity",
-        "without a delay",
+        "without `delay`",
         "DelayedObserver",
     ),
     "y lifted": (lambda o: gx.estimate(o.delayed, BOX, np.zeros((3, 2))), "estimate", "shape (T, 1)", "got (3, 2)"),

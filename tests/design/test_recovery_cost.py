@@ -7,7 +7,7 @@ from recovery_plants import PLANTS, design
 from benchmarks.recovery import Counted
 from gsisio_jax.design import recovery
 
-MOST_PROGRAMS = 1000  # linear ones of windows and of recovery, 2 ms each
+MOST_PROGRAMS = 1500  # linear ones of windows and of recovery, 1 ms each
 MOST_COMPILED = 20  # operations, 20 ms each
 
 

@@ -37,7 +37,7 @@ def run():
     y = np.array([np.asarray(_outputs(row)) for row in x]) + generator.uniform(-1, 1, (STEPS, 4)) * NOISE
     y[LOST, 1] = np.nan
     y[WRONG, 0] += 5.0
-    return x, y, gx.estimate(observer, Interval.entire(2), y)
+    return x, y, gx.estimate(observer, Interval.entire(2), y), observer
 
 
 def _hull(y, around):
@@ -51,7 +51,7 @@ def _hull(y, around):
 
 
 def test_boxes_are_near_the_set_that_agrees(run):
-    x, y, found = run
+    x, y, found, _ = run
     for k in range(STEPS):
         if k in (LOST, WRONG):
             continue
@@ -62,10 +62,22 @@ def test_boxes_are_near_the_set_that_agrees(run):
 
 
 def test_a_lost_range_widens_and_a_wrong_one_is_found(run):
-    x, _, found = run
+    x, _, found, _ = run
     assert (found.state.lower[LOST] <= x[LOST]).all()
     assert (x[LOST] <= found.state.upper[LOST]).all()
     assert np.flatnonzero(np.asarray(found.status) & gx.Status.CONFLICT).tolist() == [WRONG]
+
+
+def test_in_single_precision(run):
+    x, y, found, observer = run
+    y = y[:LOST].astype(np.float32)
+    everything = np.full(2, np.inf, np.float32)
+    single = gx.estimate(observer, Interval(-everything, everything), y).state
+    assert single.lower.dtype == np.float32
+    for k in range(LOST):
+        assert (single.lower[k] <= x[k]).all()
+        assert (x[k] <= single.upper[k]).all()
+        assert (single.width[k] <= 1.1 * found.state.width[k]).all()
 
 
 def test_only_bent_states_are_cut():
