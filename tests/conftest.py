@@ -15,7 +15,8 @@ gc.set_threshold(100_000, 20, 50)
 
 # A file stays on one worker. These take longest; begun last (they have few tests), they would leave a core idle.
 LONGEST = ("test_containment.py", "test_tune_linear.py", "test_gradients.py", "test_documents.py", "test_missing.py",
-           "test_methods.py", "test_conflicts.py", "test_tune_scale.py", "test_gallery.py", "test_past_cells.py")  # fmt: skip
+           "test_methods.py", "test_conflicts.py", "test_tune_scale.py", "test_gallery.py",
+           "test_past_cells.py")  # fmt: skip
 
 
 def pytest_collection_finish() -> None:
