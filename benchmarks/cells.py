@@ -19,6 +19,7 @@ import numpy as np
 import gsisio_jax as gx
 from benchmarks.example_hull import NOISE, _records, f, g, last_hulls
 from benchmarks.plants import from_tests
+from benchmarks.record import line, title
 from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.observer.step import advance, blank
 
@@ -56,13 +57,11 @@ def main() -> int:
             began = time.process_time()
             jax.block_until_ready(run(y))
             spent[i] = min(spent[i], time.process_time() - began)
-    print("| cells | width x1, x2 | over the hull | operations a step | microseconds a step | rate |")
-    print("| --- | --- | --- | --- | --- | --- |")
+    print(title(("cells", "width x1, x2", "over the hull", "operations a step", "microseconds a step", "rate")))
     for cells, width, size, seconds in zip(CELLS, widths, sizes, spent, strict=True):
-        print(
-            f"| {cells} | {width[0]:.3f}, {width[1]:.3f} | {', '.join(f'{r:.3f}' for r in width / hull)} | {size:,} | "
-            f"{seconds / y[..., 0].size * 1e6:.1f} | {spent[0] / seconds:.3f} |"
-        )
+        widths_of, ratios = (", ".join(f"{part:.3f}" for part in parts) for parts in (width, width / hull))
+        times = f"{seconds / y[..., 0].size * 1e6:.1f}", f"{spent[0] / seconds:.3f}"
+        print(line((str(cells), widths_of, ratios, f"{size:,}", *times)))
     print(f"hull: {hull.round(4)}")
     return 0
 

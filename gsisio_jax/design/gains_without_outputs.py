@@ -15,7 +15,7 @@ import numpy as np
 from gsisio_jax.design.gain_selection import main_gain, profile_of, with_rows
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window_program import rows_of_gains
-from gsisio_jax.design.window_runs import Rows, Runs
+from gsisio_jax.design.window_runs import Rows, Runs, mean_log_width
 from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
 
@@ -49,8 +49,7 @@ def gains_without_outputs(problem: GainProblem, bank: list[np.ndarray], region: 
         more = rows_of_gains(scaled, [problem.scaled_gain(N, width) for N in gains], 1)
         for state, parts in zip(more.states, more.parts, strict=True):
             rows.add(state, parts)
-        runs = Runs(scaled, 1, np.full(problem.n, 1.5), np.random.default_rng(0)).of(rows, False)
-        return np.mean([np.log(np.maximum(below + above, 1e-12)) for _, _, below, above in runs], (0, 1))
+        return mean_log_width(Runs(scaled, 1, np.full(problem.n, 1.5), np.random.default_rng(0)).of(rows, False))
 
     now = reached_with([])
     rows: list[list[np.ndarray]] = [[] for _ in range(problem.n)]

@@ -43,6 +43,11 @@ class Rows:
         return np.flatnonzero(np.array(self.states) == state)
 
 
+def mean_log_width(run: list) -> np.ndarray:
+    """Mean logarithm (n,) of the widths in the steps of a run: narrow boxes count as much as wide ones."""
+    return np.mean([np.log(np.maximum(below + above, 1e-12)) for *_, below, above in run], (0, 1))
+
+
 class Runs:
     """Simulated runs of the observer in errors, `RUNS` side by side: distances (S, n) of both sides from the state."""
 

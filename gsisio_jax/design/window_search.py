@@ -8,7 +8,7 @@ import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window_program import WindowProgram, rows_of_gains
-from gsisio_jax.design.window_runs import FAR, RUNS, Rows, Runs, measured, sizes_of_parts
+from gsisio_jax.design.window_runs import FAR, RUNS, Rows, Runs, mean_log_width, measured, sizes_of_parts
 
 WORTH = 0.05  # share of the width of some state that a window must bring to be worth its operations
 _SAMPLES = 6  # steps of a round of runs for which exact rows are asked
@@ -82,8 +82,7 @@ class Search:
         if not kept:
             return False
         now, best = (self._first_steps(self.with_gains(rows)) for rows in ([], kept))
-        logs = [np.mean([np.log(np.maximum(a + b, 1e-12)) for *_, a, b in run], (0, 1)) for run in (now, best)]
-        return bool((logs[1] < logs[0] + np.log(1 - _WORTH_EARLY)).any())
+        return bool((mean_log_width(best) < mean_log_width(now) + np.log(1 - _WORTH_EARLY)).any())
 
     def _first_steps(self, rows: Rows) -> list:
         """Of runs that begin at the region's width."""

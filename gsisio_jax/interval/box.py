@@ -235,6 +235,13 @@ def add(*boxes: Interval) -> Interval:
     return Interval.unchecked(_add_down([box.lower for box in boxes]), -_add_down([-box.upper for box in boxes]))
 
 
+def in_a_row(*boxes: Interval) -> Interval:
+    """All entries of some boxes, one box behind the other."""
+    return Interval.unchecked(
+        *(jnp.concatenate([getattr(b, side).ravel() for b in boxes]) for side in ("lower", "upper"))
+    )
+
+
 def _add_down(values: list[Any]) -> Any:
     total = sum(values[1:], values[0])
     if len(values) == 1 or not rounding.outward():

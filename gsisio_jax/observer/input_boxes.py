@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.atoms import States
-from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.interval.box import Interval, in_a_row, is_concrete
 from gsisio_jax.interval.image import plain_image, widened_for_sums
 from gsisio_jax.interval.minmax import smaller
 from gsisio_jax.interval.primitives import matmul, scale
@@ -93,7 +93,7 @@ def exact_input(
     if not observer.system.p:
         return d, domain
     terms = explained.shape[0] + known.shape[0]
-    joined = widened_for_sums(_joined(explained, known), terms)
+    joined = widened_for_sums(in_a_row(explained, known), terms)
 
     def image_of(rows: Any, of_known: Any, residual: Any) -> Interval:
         found = plain_image(jnp.concatenate([rows, of_known], -1), joined)
@@ -106,10 +106,6 @@ def exact_input(
     balance = image_of(exact.circuits, exact.circuits_known, constants.circuits)
     slack = smaller(balance.upper, -balance.lower)
     return met.box, domain.record_margin(jnp.where(believed, slack, jnp.inf), Source.BALANCE)
-
-
-def _joined(*boxes: Interval) -> Interval:
-    return Interval.unchecked(*(jnp.concatenate([getattr(b, side) for b in boxes]) for side in ("lower", "upper")))
 
 
 def _beyond_inverses(observer: Observer) -> Any:

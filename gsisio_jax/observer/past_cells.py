@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.interval.box import Interval, choose, is_concrete
+from gsisio_jax.interval.box import Interval, choose, in_a_row, is_concrete
 from gsisio_jax.interval.image import loose_matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.observer.bank import Known
@@ -53,7 +53,7 @@ def contract(
     parts = [*(bank.reshape(-1, bank.shape[-1]) for bank in banks), free.weights]
     weights = (np if all(map(is_concrete, parts)) else jnp).concatenate(parts)
     rows, outputs = maps.rows(weights), maps.rows(maps.on_outputs(observer.T2))
-    added = _joined(known.right, known.inputs, _balance(free, domain, known, lost))
+    added = in_a_row(known.right, known.inputs, _balance(free, domain, known, lost))
     # Rows that use a measurement that is not believed say nothing.
     uses = (weights[:, system.n :] != 0).any(-1)
     added = everything_unless(~carry.starts & jnp.logical_or(carry.believed, ~uses), added)
@@ -71,7 +71,7 @@ def contract(
         found = Interval.unchecked(found.lower + added.lower, found.upper + added.upper)
         if along is not None:
             met, room = free.met(found[count:], maps.terms)
-            found = _joined(found[:count], met)
+            found = in_a_row(found[:count], met)
             slack.append(room)
         return found, jnp.concatenate(slack)
 
@@ -85,7 +85,7 @@ def contract(
 
 def _balance(free: FreeRows, domain: Domain, known: Known, lost: Lost) -> Interval:
     """What is known of the rows besides f and g (c,), with what they leave of d[k-1] and miss of their direction."""
-    joined = _joined(known.terms.shift, known.terms.known)
+    joined = in_a_row(known.terms.shift, known.terms.known)
     weights = jnp.concatenate([free.weights, free.known], -1)
     found = plain_image(weights, widened_for_sums(joined, weights.shape[-1]))
     found = plainly_wider(found, lost.of_inputs(free.lost, domain.box))
@@ -93,13 +93,6 @@ def _balance(free: FreeRows, domain: Domain, known: Known, lost: Lost) -> Interv
         return found
     errors = np.nextafter(free.errors.astype(domain.box.dtype), np.inf)
     return plainly_wider(found, loose_matvec_upper(errors, lost.magnitudes(domain.box)[0]))
-
-
-def _joined(*boxes: Interval) -> Interval:
-    """All entries of some boxes in a row."""
-    return Interval.unchecked(
-        jnp.concatenate([box.lower.ravel() for box in boxes]), jnp.concatenate([box.upper.ravel() for box in boxes])
-    )
 
 
 def _narrowed(whole: Interval, parts: Interval) -> Interval:
