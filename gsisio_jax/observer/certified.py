@@ -13,15 +13,13 @@ from gsisio_jax.interval.image import plain_image
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
 from gsisio_jax.observer.bank import Known
-from gsisio_jax.observer.contractors import Newton, centred_form
+from gsisio_jax.observer.contractors import Newton, centred_form, repeated
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.lost import plainly_wider
 from gsisio_jax.observer.maps import Maps, at_point
 from gsisio_jax.observer.measurement import everything_unless, in_box, inside
 from gsisio_jax.observer.status import Source
 from gsisio_jax.observer.types import Carry, RoundingConstants
-
-_UNROLLED = 3  # rounds that are written out
 
 
 class Promised(NamedTuple):
@@ -71,12 +69,15 @@ def certified(
     N_z, V, steps = gains.remainder[0], observer.region_inverse, observer.corrections
     found = []
     if steps or not constants.rounds:
-        box = centred_form(joint, N_z, V, psi, safe, maps.terms, newton=newton if steps else None, corrections=steps)
+        improve = newton if steps else None
+        written = steps if maps.expansion is not None else maps.written
+        box = centred_form(joint, N_z, V, psi, safe, maps.terms, None, improve, steps, written)
         safe = Interval.unchecked(raised(safe.lower, box.lower), cut(safe.upper, box.upper))
         found.append(everything_unless(applies, box))
     if constants.rounds:
         whole = _bounded(region, observer.system.state_bounds, right.dtype)
-        box = _recentred(joint, N_z, constants.implicit, psi, safe, whole, maps.terms, constants.rounds)
+        rounds, written = constants.rounds, maps.written
+        box = _recentred(joint, N_z, constants.implicit, psi, safe, whole, maps.terms, rounds, written)
         found.append(everything_unless(applies, box))
     return domain.intersect(jax.tree.map(lambda *sides: jnp.stack(sides), *found), Source.CERTIFICATE), promised
 
@@ -89,7 +90,15 @@ def _bounded(region: Interval, bounds: Interval, dtype: Any) -> Interval:
 
 
 def _recentred(
-    right: Interval, N_z: Any, implicit: Any, remainder: Any, within: Interval, whole: Interval, terms: int, rounds: int
+    right: Interval,
+    N_z: Any,
+    implicit: Any,
+    remainder: Any,
+    within: Interval,
+    whole: Interval,
+    terms: int,
+    rounds: int,
+    written: int,
 ) -> Interval:
     """Bound x, where ``x + N_z psi(x) in right`` and x lies in `within`, about the middle of what is left of that.
 
@@ -106,6 +115,7 @@ def _recentred(
         whole: box (n,) that holds `within`, finite.
         terms: of a row, for rounding.
         rounds: how often, at least 1.
+        written: more are a loop, in which psi is compiled once.
 
     Source: theory 5.6.
     """
@@ -124,11 +134,7 @@ def _recentred(
     if rounds > 1:
         within = turn(within, whole)
         rounds -= 1
-    if rounds <= _UNROLLED:
-        for _ in range(rounds):
-            within = turn(within, within)
-        return within
-    return jax.lax.scan(lambda box, _: (turn(box, box), None), within, None, length=rounds)[0]
+    return repeated(lambda box: turn(box, box), within, rounds, written)
 
 
 def _reach(constants: RoundingConstants, before: Interval, promised: Promised) -> tuple[Any, Any]:

@@ -6,8 +6,10 @@ atoms are widened once per box, for all linear images (`inclusion.atoms`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -173,6 +175,7 @@ def centred_form(
     left: Any = None,
     newton: Newton | None = None,
     corrections: int = 1,
+    written: int = 3,
 ) -> Interval:
     """Bound x by its distance from one point c, where ``x + N_z psi(x) in right`` and x lies in `within`.
 
@@ -191,6 +194,7 @@ def centred_form(
         left: (n, n), what `right` leaves of x by rounding.
         newton: where b comes from; without it ``b = clip(mid)``.
         corrections: number of its steps. Every one after the first takes a value of psi.
+        written: more are a loop, in which psi is compiled once.
 
     Source: theory 5.3 and 5.6.
     """
@@ -198,9 +202,13 @@ def centred_form(
     before = clip(middle if newton is None else newton.begin(middle), within)
     center, error = remainder(before)
     if newton is not None:
-        for _ in range(corrections - 1):
+
+        def corrected(found: Any) -> Any:
+            before, center, _ = found
             before = clip(newton.improved(before, middle - matmul(N_z, center) - before), within)
-            center, error = remainder(before)
+            return before, *remainder(before)
+
+        before, center, error = repeated(corrected, (before, center, error), corrections - 1, written)
     c = clip(middle - matmul(N_z, center), within)
     error = matmul(abs(N_z), error) + wider(abs(middle) + matmul(abs(N_z), abs(center)), terms)
     move = abs(c - before)
@@ -210,6 +218,15 @@ def centred_form(
     away = scale(inverse, far).sum(-1)
     away = away - move + wider(abs(c) + away + far, terms)
     return Interval.unchecked(c - away, c + away)
+
+
+def repeated(turn: Callable[[Any], Any], state: Any, count: int, written: int) -> Any:
+    """`turn` applied `count` times: written out up to `written`, else a loop."""
+    if count <= written:
+        for _ in range(count):
+            state = turn(state)
+        return state
+    return jax.lax.scan(lambda state, _: (turn(state), None), state, None, length=count)[0]
 
 
 def clip(value: Any, box: Interval) -> Any:

@@ -65,18 +65,22 @@ def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: A
     if rounding.outward():
         lost = loose_matvec_upper(observer.rounding_constants.gains.d, inputs)
         right = Interval.unchecked(right.lower - lost, right.upper + lost)
-    for i, k in enumerate(first.gains):
-        if k in first.linear:
-            continue  # the linear form says as much, and costs no value of g
-        left = first.cancellation_residual[k] if rounding.outward() else None
+    # Where the linear form serves it says as much, and costs no value of g.
+    rest = [(i, k) for i, k in enumerate(first.gains) if k not in first.linear]
+    if rest:
+        bounds = observer.system.state_bounds
 
         def psi(x: Any) -> tuple[Any, Any]:
             return at_point(maps.remainder, x, wider(abs(x), maps.terms), *maps.free_at(x, u))
 
-        bounds = observer.system.state_bounds
-        box = centred_form(right[k], gains.remainder[k], first.inverses[i], psi, bounds, maps.terms, left)
-        box = choose(in_box(u, observer.u_region), box, entire_like(box))
-        domain = domain.intersect(box[None], Source.STATE)
+        def of_gain(right: Interval, N_z: Any, inverse: Any, left: Any) -> Interval:
+            return centred_form(right, N_z, inverse, psi, bounds, maps.terms, left)
+
+        left = first.cancellation_residual if rounding.outward() else None
+        each = [(right[k], gains.remainder[k], first.inverses[i], None if left is None else left[k]) for i, k in rest]
+        boxes = _each(of_gain, each, together=maps.expansion is None)
+        boxes = choose(in_box(u, observer.u_region), boxes, entire_like(boxes))
+        domain = domain.intersect(boxes, Source.STATE)
     if first.linear and first.form is not None:
         chosen, N_z = jax.tree.map(lambda x: jnp.stack([x[k] for k in first.linear]), (right, gains.remainder))
         offset = image(-N_z, first.form.offset)
@@ -88,3 +92,11 @@ def initial_boxes(maps: Maps, domain: Domain, right: Interval, inputs: Any, u: A
             boxes = Interval.unchecked(boxes.lower - left, boxes.upper + left)
         domain = domain.intersect(boxes, Source.STATE)
     return domain
+
+
+def _each(function: Any, of: list[Any], together: bool) -> Interval:
+    """A box for each of several tuples of arguments, stacked. Over arrays all are computed at once: g is traced and
+    compiled once for them. Over numbers one by one: constants stay constants."""
+    if together and len(of) > 1:
+        return jax.vmap(function)(*jax.tree.map(lambda *rows: jnp.stack(rows), *of))
+    return jax.tree.map(lambda *sides: jnp.stack(sides), *(function(*args) for args in of))

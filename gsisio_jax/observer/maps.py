@@ -77,6 +77,11 @@ class Maps:
         )
         return system.n + atoms + self.observer.T2.shape[0] + 4 + steps
 
+    @property
+    def written(self) -> int:
+        """Rounds with a value of psi that are written out; more are a loop. Over arrays psi is most of a step."""
+        return 1 if self.expansion is None else 3
+
     def states(self, box: Interval) -> States:
         return States.of(box, self.terms)
 

@@ -33,6 +33,7 @@ _FAR = 64  # periods from 0 at which a periodic state is moved back to it
 _EDGE = 64.0  # units in the last place by which a record may miss its own noise bounds
 
 Contract = Callable[[Maps, Carry, Any, Any, Noise], tuple[Domain, Domain, Interval]]
+Alone = Callable[[Maps, Carry, Any, Any, Noise], Domain]
 
 
 class Unwrapped(NamedTuple):
@@ -130,9 +131,11 @@ def ranges_on(maps: Maps, box: Interval, u: Any) -> Interval:
 
 
 def contract(
-    once: Contract, maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool
+    once: Contract, alone: Alone, maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool
 ) -> tuple[Domain, Domain, Interval, Unwrapped]:
     """What `once`, a contraction with a given y[k], says of x[k] and d[k-1] where entries of y[k] are periodic.
+
+    `alone` gives what y[k] and the state bounds say.
 
     Returns:
         The box of x[k]; the one to go on from after a conflict; the box of d[k-1]; and y[k] on the real line, as it
@@ -140,16 +143,25 @@ def contract(
     """
     system, lost = maps.observer.system, jnp.full_like(y, jnp.nan)
     rows = [j for j, _ in system.periodic]
-    past, alone, _ = once(maps, carry, _with(y, rows, lost[: len(rows)]), u, noise)
-    now = unwrap(system, ranges_on(maps, past.box, u), y, u, noise)
-    domain, _, d = once(maps, carry, now.y, u, now.noise)
+
+    def turn(seen: Unwrapped) -> tuple[Unwrapped, Any]:
+        found, fallback, d = once(maps, carry, seen.y, u, seen.noise)
+        return unwrap(system, ranges_on(maps, found.box, u), y, u, noise), (seen, found, fallback, d)
+
+    unknown = Unwrapped(_with(y, rows, lost[: len(rows)]), noise, jnp.zeros(len(rows), bool), jnp.full_like(y, jnp.inf))
+    if maps.expansion is None:  # large: compiled once for both
+        turns = jax.lax.scan(lambda seen, _: turn(seen), jax.tree.map(jnp.asarray, unknown), None, length=2)[1]
+        (_, _, fallback, _), (now, domain, _, d) = (jax.tree.map(lambda leaf, i=i: leaf[i], turns) for i in range(2))
+    else:
+        now, (_, _, fallback, _) = turn(unknown)
+        domain, _, d = once(maps, carry, now.y, u, now.noise)
     domain = domain.record_margin(now.slack, Source.PERIODIC)
     if hold:
         fallback, _, _ = once(maps, carry, lost, u, noise)
         then = Unwrapped(lost, noise, jnp.zeros_like(now.open), jnp.full_like(y, jnp.inf))
     else:
-        then = unwrap(system, ranges_on(maps, alone.box, u), y, u, noise)
-        _, fallback, _ = once(maps, carry, then.y, u, then.noise)
+        then = unwrap(system, ranges_on(maps, fallback.box, u), y, u, noise)
+        fallback = alone(maps, carry, then.y, u, then.noise)
         fallback = fallback.record_margin(then.slack, Source.PERIODIC)
     conflict = domain.conflict
     chosen = now.unless(conflict, then)

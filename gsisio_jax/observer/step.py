@@ -63,7 +63,7 @@ def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold
     """
     maps = Maps.of(observer, y.dtype)
     if observer.system.periodic:
-        domain, fallback, d, seen = periodic.contract(_contract, maps, carry, y, u, noise, hold)
+        domain, fallback, d, seen = periodic.contract(_contract, _alone, maps, carry, y, u, noise, hold)
         after, out = _finish(maps, domain, fallback, carry, d, seen.y, u, seen.noise, hold)
         return after, periodic.noted(out, y, seen)
     domain, fallback, d = _contract(maps, carry, y, u, noise)
@@ -123,8 +123,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
     # 3. y[k] and the state bounds, which are all that a restart begins with, and the initial box, if this is the start;
     # then what needs no box to begin with.
     with _stage("initial"):
-        first = FirstForm.of(observer, u)
-        nothing = Domain.of(typed(bounds, y.dtype), size)
+        first, nothing = FirstForm.of(observer, u), Domain.of(typed(bounds, y.dtype), size)
         alone = _output(nothing, maps.states(bounds), first.on(bounds), known.z)
         domain = nothing.intersect(everything_unless(carry.starts, before)[None], Source.INITIAL)
         if observer.recovery:
@@ -186,6 +185,14 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
         d, domain = certified_input(maps, domain, states, promised, known, left[1], d)
         d, domain = exact_from_box(maps, domain, moved, carry, known.terms, d, lost)
     return domain, alone, d
+
+
+def _alone(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> Domain:
+    """The box that y[k] and the state bounds alone give, as `_contract` has it."""
+    observer, bounds = maps.observer, maps.observer.system.state_bounds
+    size = largest_magnitude(y, carry.y, maps.states(carry.state).magnitude)
+    nothing, form = Domain.of(typed(bounds, y.dtype), size), FirstForm.of(observer, u).on(bounds)
+    return _output(nothing, maps.states(bounds), form, _known(observer, carry, y, u, noise).z)
 
 
 def _output(domain: Domain, states: States, form: Affine, z: Interval) -> Domain:
