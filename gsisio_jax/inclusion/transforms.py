@@ -208,7 +208,8 @@ def _traced(f: Callable[..., Any], x: Any, *args: Any) -> tuple[Any, Any]:
     with contextlib.suppress(ValueError, TypeError):  # none to be found
         signature = inspect.signature(f)
     try:
-        signature is None or signature.bind(x, *args)
+        if signature is not None:
+            signature.bind(x, *args)
     except TypeError as error:
         raise ValueError(
             f"inclusion: the function takes {signature}, and is called with x and {len(args)} further arguments "
