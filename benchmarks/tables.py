@@ -90,8 +90,8 @@ def _measured(found: dict[str, Any]) -> str:
 
 _OTHERS = {"handwritten": "by hand", "C": "C", "older": "older version"}
 _KEPT = (
-    "ablation", "delay", "dials", "dials_rotation", "directions", "gradients", "models", "plants_before", "recovery",
-    "row_directions", "size", "tightness", "tightness_default",
+    "ablation", "delay", "dials", "directions", "gradients", "models", "recovery", "size", "tightness",
+    "tightness_default",
 )  # fmt: skip
 TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
     "limit": limit, "rounding": rounding, "peers": peers, "plants": plants, "soak": soak.table,

@@ -166,6 +166,9 @@ def _labels(
     for what, values in (("names", names), ("units", units)):
         if len(values) != count:
             raise ValueError(f"to_dataset: `{kind}_{what}` has {len(values)} entries, the estimate has {count}")
+        other = next((value for value in values if not isinstance(value, str)), None)
+        if other is not None:
+            raise ValueError(f"to_dataset: `{kind}_{what}` must be a list of {count} words, got {other!r} in it")
     return names, units
 
 

@@ -39,10 +39,15 @@ def check_trace(name: str, first: Any, second: Any) -> None:
         "x has one entry per row of G, u one per known input",
     )
 
+    refuse_change(f"System: {name}", first, second, "; noise is w and v")
+
+
+def refuse_change(function: str, first: Any, second: Any, besides: str = "") -> None:
+    """Refuse a function whose constants differ from one trace to the next: numpy.random, the time, a counter."""
     if not _same(list(_numbers(first)), list(_numbers(second))):
         raise ValueError(
-            f"System: {name} is another function every time it is called: its constants differ (numpy.random? the "
-            "time? a counter?). Compute them once, outside of it; noise is w and v"
+            f"{function} is another function every time it is called: its constants differ (numpy.random? the "
+            f"time? a counter?). Compute them once, outside of it{besides}"
         )
 
 

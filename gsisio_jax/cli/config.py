@@ -171,6 +171,8 @@ def _one_line(error: ValidationError) -> str:
         text = f"unknown {kind} {key}{_did_you_mean(first['loc'])}"
     elif kind == "value_error":
         text = f"{key}: {first.get('ctx', {}).get('error', first['msg'])}"
+    elif kind in ("too_short", "string_too_short"):
+        text = f"{key} must have at least one entry, got {first['input']!r}"
     else:
         message = first["msg"].removeprefix("Input should be ")
         got = repr(first["input"])

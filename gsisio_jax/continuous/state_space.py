@@ -97,6 +97,8 @@ def _read(sys: Any) -> tuple[list[np.ndarray], Any]:
             raise ValueError(
                 f"{_CALL}: {name} must have shape {shape}, got {matrix.shape}; give matrices of two dimensions"
             )
+        if not np.isfinite(matrix).all():
+            raise ValueError(f"{_CALL}: {name} has an entry that is not finite; every number of the model is needed")
     if period is not True and not (isinstance(period, int | float | np.number) and period >= 0):
         raise ValueError(f"{_CALL}: the period of a discrete model must be a positive number, or True; got {period!r}")
     return found, period

@@ -12,6 +12,7 @@ from gsisio_jax.observer.checks import refuse_input_model
 from gsisio_jax.plant.system import Noise, System
 
 _MOST_CELLS = 10_000
+_MOST_STEPS = 1000
 
 
 def checked(
@@ -50,6 +51,11 @@ def checked(
     if window != "auto" and steps < 1:
         raise ValueError(
             f'design_observer: `window` must be a whole number of steps, at least 1, or "auto", got {window!r}'
+        )
+    if steps > _MOST_STEPS:
+        raise ValueError(
+            f"design_observer: `window` must be at most {_MOST_STEPS} steps, got {window!r}: every row is a linear "
+            'program over all of them. "auto" takes the shortest that helps, rarely more than five'
         )
     if window not in (1, "auto") and (form == "prediction" or system.periodic_states):
         raise ValueError(

@@ -46,6 +46,11 @@ def batched(bounds: Callable[..., Any], shared: bool = True, chunk: int = CHUNK)
 
     Source: theory 9.
     """
+    if not callable(bounds):
+        raise ValueError(
+            f"inclusion.batched: `bounds` must be a function of a box, as inclusion.natural(f) is, got "
+            f"{type(bounds).__name__}"
+        )
     if not is_whole(chunk) or chunk < 1:
         raise ValueError(f"inclusion.batched: `chunk` must be a whole number of boxes of at least 1, got {chunk!r}")
 

@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.inclusion.combinations import Share
 from gsisio_jax.inclusion.form_arithmetic import (
     box_sum,
     finite_numbers,
@@ -158,12 +159,16 @@ class Node(eqx.Module):
 
     Sums hand a NaN on, so it need not be looked for after each of them: `unnormalised` nodes may hold one where they
     overflowed, until `normalise` turns it into "no bound". Every rule that compares its arguments does that first.
+
+    A range with a `share` is a sum of operands that were widened before (`combinations`): the next linear operation
+    need not widen it.
     """
 
     given: Interval | None
     form: Form | None = None
     jac: Interval | None = None
     unnormalised: bool = eqx.field(static=True, default=False)
+    share: Share | None = eqx.field(static=True, default=None)
 
     @property
     def range(self) -> Interval:
@@ -230,9 +235,11 @@ def best_form(slope: Any, offset: Interval, natural: Interval, box: InputBox, sl
     return Form(fusion_barrier(jnp.where(good, slope, 0)), computed_once(choose(good, offset, natural)), box, slack)
 
 
-def unnormalised_node(given: Interval | None, form: Form | None, jac: Interval | None) -> Node:
+def unnormalised_node(
+    given: Interval | None, form: Form | None, jac: Interval | None, share: Share | None = None
+) -> Node:
     """A node that a linear rule made; to nearest it is normalised at once."""
-    return Node(given, form, jac, rounding.outward())
+    return Node(given, form, jac, rounding.outward(), share)
 
 
 def normalised(value: Any) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -17,7 +19,7 @@ from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node,
 from gsisio_jax.interval.box import Interval, choose
 from gsisio_jax.interval.primitives import add_up
 from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
-from gsisio_jax.traced import refuse_trace
+from gsisio_jax.traced import refuse_change, refuse_trace
 from gsisio_jax.tracing import explained
 
 
@@ -40,6 +42,8 @@ class AffineForm(eqx.Module):
 
     def over(self, box: Interval) -> Interval:
         """Bounds of f on a box inside X, from slope and offset alone; shape (*out)."""
+        if not isinstance(box, Interval):
+            raise ValueError(f"AffineForm.over: `box` must be an Interval of shape (n,), got {type(box).__name__}")
         slope = jnp.moveaxis(jnp.asarray(self.slope), -1, 0)
         return guard(box_sum(slope_image(slope, box.astype(slope.dtype)), self.offset))
 
@@ -189,14 +193,39 @@ def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable
     shapes = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), values, is_leaf=is_node)
     if not callable(f):
         raise ValueError(f"inclusion: bounds are of a function of x, got {type(f).__name__}")
-    with explained(f"inclusion: calling the function with x of shape {x.shape}"):
-        closed, out = jax.make_jaxpr(f, return_shape=True)(jax.ShapeDtypeStruct(x.shape, x.dtype), *shapes)
+    closed, out = _traced(f, jax.ShapeDtypeStruct(x.shape, x.dtype), *shapes)
     _check_results(closed, x.shape)
     inputs = [x, *jax.tree.leaves(values, is_leaf=is_node)]
     results = evaluate(closed.jaxpr, closed.consts, inputs)
     nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
     nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
     return jax.tree.unflatten(jax.tree.structure(out), [finish(_in_type(node, x.dtype)) for node in nodes])
+
+
+def _traced(f: Callable[..., Any], x: Any, *args: Any) -> tuple[Any, Any]:
+    """f as a jaxpr, and the structure of what it returns. One of the user's is called twice: it might draw numbers."""
+    signature = None
+    with contextlib.suppress(ValueError, TypeError):  # none to be found
+        signature = inspect.signature(f)
+    try:
+        if signature is not None:
+            signature.bind(x, *args)
+    except TypeError as error:
+        raise ValueError(
+            f"inclusion: the function takes {signature}, and is called with x and {len(args)} further arguments "
+            f"({error}); bounds(box, *args) hands args on, functools.partial binds parameters"
+        ) from None
+    ours = (getattr(f, "__module__", None) or type(f).__module__).startswith("gsisio_jax.")
+    with explained(f"inclusion: calling the function with x of shape {x.shape}"):
+        try:
+            found = jax.make_jaxpr(f, return_shape=True)(x, *args)
+        except TypeError as error:
+            if "not a valid JAX type" not in str(error):
+                raise
+            raise ValueError(f"inclusion: the function must return an array; {str(error).splitlines()[0]}") from None
+        if not ours:
+            refuse_change("inclusion: the function", found[0], jax.make_jaxpr(lambda *given: f(*given))(x, *args))
+    return found
 
 
 def _check_results(closed: Any, shape: tuple[int, ...]) -> None:

@@ -163,19 +163,21 @@ class Interval(eqx.Module):
             margin: in the unit of the box.
 
         Raises:
-            ValueError: the shapes do not fit.
+            ValueError: the shapes do not fit; the margin is NaN.
         """
         if type(value) is not np.ndarray:
             value = read_array("Interval.contains", "value", value, missing=True)
         if type(margin) is not float:
             margin = read_array("Interval.contains", "margin", margin)
+        if is_concrete(margin) and np.isnan(margin).any():
+            raise ValueError("Interval.contains: `margin` is NaN; give a number in the unit of the box")
         _check_fits(self.shape, value.shape)
         return (self.lower + margin <= value) & (value <= self.upper - margin)
 
     def astype(self, dtype: Any) -> Interval:
         """The smallest box of that floating type that contains this one (a narrowing cast rounds outward)."""
-        if not jnp.issubdtype(dtype, jnp.floating):
-            raise ValueError(f"Interval.astype: bounds have a floating type (float64, float32), got {dtype}")
+        if not _is_floating(dtype):
+            raise ValueError(f"Interval.astype: bounds have a floating type (float64, float32), got {dtype!r}")
         lower = cast_down(self.lower, dtype)
         if self.lower is self.upper and self.lower.dtype == lower.dtype:  # known to be a point: that stays known
             return Interval.unchecked(*rounding.normal(lower, lower))
@@ -186,6 +188,13 @@ class Interval(eqx.Module):
         if is_concrete(self.lower) and is_concrete(self.upper):
             return f"Interval({np.asarray(self.lower)}, {np.asarray(self.upper)})"
         return f"Interval({self.lower}, {self.upper})"
+
+
+def _is_floating(dtype: Any) -> bool:
+    try:
+        return jnp.issubdtype(dtype, jnp.floating)
+    except TypeError:  # no type at all
+        return False
 
 
 def _check_fits(box: tuple[int, ...], value: tuple[int, ...]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, nan_to_unbounded
+from gsisio_jax.interval.box import Interval, is_concrete, nan_to_unbounded
 from gsisio_jax.interval.primitives import add_up, scale
 from gsisio_jax.interval.reading import read_array
 
@@ -26,7 +26,7 @@ def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
         Box of shape (m,), units [y].
 
     Raises:
-        ValueError: shapes do not agree.
+        ValueError: shapes do not agree; the matrix is not finite.
 
     >>> linear_image(np.array([[1.0, -2.0]]), Interval([0.0, 0.0], [1.0, 1.0]))
     Interval([-2.], [1.])
@@ -36,6 +36,8 @@ def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
     if not isinstance(x, Interval):
         raise ValueError(f"linear_image: `x` must be a gsisio_jax.Interval of shape (n,), got {type(x).__name__}")
     matrix = read_array("linear_image", "matrix", matrix)
+    if is_concrete(matrix) and not np.isfinite(np.asarray(matrix)).all():
+        raise ValueError("linear_image: `matrix` must be finite; only the box may have infinite sides")
     if np.ndim(matrix) != 2 or len(x.shape) != 1 or matrix.shape[1] != x.shape[0]:
         raise ValueError(
             f"linear_image: a matrix (m, n) and a box (n,) are needed, got {np.shape(matrix)} and {x.shape}"

@@ -49,6 +49,10 @@ def framers(
     record = read_record(dataset_or_estimate)
     names = list(record.series) if signals is None else list(signals)
     every = record.series | record.outputs
+    if truth is not None and not isinstance(truth, Mapping):
+        raise ValueError(
+            f'framers: `truth` must have true values by signal name, as {{"x1": x[:, 0]}}, got {type(truth).__name__}'
+        )
     check_signals("framers", [*names, *(truth or {})], list(every))
     axes, figure = style.panels("framers", len(names), ax, style.stacked)
     for axis, name in zip(axes, names, strict=True):

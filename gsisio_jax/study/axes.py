@@ -66,6 +66,9 @@ def grid(name: str, value: Any, coordinate: Any = None, unit: str = "") -> Axis:
         raise ValueError(f"grid: `name` must be a word other than {', '.join(TAKEN)}; got {name!r}")
     if isinstance(value, Axis):
         raise ValueError(f"grid: the value of {name!r} lies on the axis {value.name!r} already; wrap it once")
+    if value is None or (isinstance(value, list | tuple) and not value):
+        got = "nothing (None)" if value is None else "an empty list"
+        raise ValueError(f"grid: the value of {name!r} must have a leading axis, one entry per element, got {got}")
     if coordinate is not None:
         if isinstance(coordinate, np.ma.MaskedArray) and np.ma.is_masked(coordinate):
             raise ValueError(f"grid: `coordinate` of {name!r} has masked entries; every element needs its label")

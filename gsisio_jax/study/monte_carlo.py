@@ -168,6 +168,10 @@ def monte_carlo(
 
 
 def _numbers(runs: int | Sequence[int]) -> np.ndarray:
+    if isinstance(runs, Interval):
+        raise ValueError(
+            f"{CALL}: `runs` must be a number of runs, got Interval; are the arguments in the right order?"
+        )
     numbers = np.arange(runs) if isinstance(runs, int | np.integer) and runs > 0 else np.asarray(runs)
     if numbers.ndim != 1 or not numbers.size or numbers.dtype.kind not in "iu" or numbers.min() < 0:
         raise ValueError(f"{CALL}: `runs` must be a number of runs, at least 1, or the numbers of runs; got {runs!r}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -232,7 +233,7 @@ def quantiles(*probabilities: float) -> Quantiles:
     >>> quantiles(0.5, 0.95).probabilities
     (0.5, 0.95)
     """
-    if not probabilities or not all(0 <= q <= 1 for q in probabilities):
+    if not probabilities or not all(isinstance(q, int | float | np.number) and 0 <= q <= 1 for q in probabilities):
         raise ValueError(f"quantiles: give probabilities between 0 and 1, for example 0.5, 0.95; got {probabilities}")
     return Quantiles(tuple(float(q) for q in probabilities))
 
@@ -262,6 +263,10 @@ def resolve(call: str, reduce: Any, truth: bool) -> tuple[Reduction, ...]:
     Raises:
         ValueError: an unknown name, one twice, or a reduction that needs the truth where there is none.
     """
+    if not (reduce is None or isinstance(reduce, str | Reduction | Iterable)):
+        raise ValueError(
+            f'{call}: `reduce` must name reductions, as "final" or ["final", "mean"], got {type(reduce).__name__}'
+        )
     asked = ("boxes",) if reduce is None else (reduce,) if isinstance(reduce, str | Reduction) else tuple(reduce)
     known = ", ".join(REDUCTIONS)
     found = []

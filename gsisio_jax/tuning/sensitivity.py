@@ -52,7 +52,7 @@ def width_sensitivity(
         names: the user's own names, "state", "output" and "input".
 
     Returns:
-        An `xarray.Dataset` over kind, signal (states, then inputs) and bound (w, v, initial box, parameters): `width`
+        `xarray.Dataset` over kind, signal (states, then inputs) and bound (w, v, initial box, parameters), with `width`
         (kind, signal), `derivative` (kind, signal, bound), and `elasticity`, the share of the width that a share of the
         bound is worth: 1 says that 10 % off the bound takes 10 % off the width. Where a width is infinite, NaN. The
         certificate knows no initial box; its derivative by it is 0, and that by a parameter takes the gain as

@@ -153,3 +153,19 @@ def test_what_does_not_enter_has_no_derivative_at_all():
     assert not np.asarray(slopes.lower)[:, 2].any()
     assert not np.asarray(slopes.upper)[:, 2].any()
     assert np.isfinite(inclusion.mean_value(f)(box).width).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_norms_of_numbers_of_very_different_size(dtype):
+    """x / |(x, y)| with an x so far below y that one of them is lost wherever both are scaled alike."""
+    slope = jax.jit(inclusion.jacobian(lambda v: jnp.sqrt(v[0] ** 2 + v[1] ** 2)))
+    most = 20 if dtype == np.float32 else 240
+    rng = np.random.default_rng(0)
+    for x, y in 10.0 ** rng.uniform(-most, most, (200, 2)):
+        x, y = dtype(x), dtype(y)
+        found = slope(Interval(np.array([-x, y], dtype), np.array([x, y * dtype(4)], dtype)))
+        far = Fraction(float(x)) ** 2 + Fraction(float(y)) ** 2
+        upper, lower = (Fraction(float(side[0])) for side in (found.upper, found.lower))
+        assert upper**2 * far >= Fraction(float(x)) ** 2
+        assert lower < 0
+        assert lower**2 * far >= Fraction(float(x)) ** 2

@@ -14,12 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.inclusion import combinations
 from gsisio_jax.inclusion.form_arithmetic import (
     added_slack,
     box_sum,
     fold,
+    is_exact,
     is_known,
     is_point,
+    is_zero,
     known_if_concrete,
     product,
     scaled,
@@ -61,7 +64,8 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
     # Of linear functions: the form says all, and its image is the range.
     linear = known and any(v.form is not None for v in nodes) and all(v.is_static_affine for v in nodes)
     box = next(v.form.box for v in nodes if v.form is not None) if linear else box
-    adds = terms > 1 and rounding.outward()
+    share = None if box is not None or jac is not None else combinations.together([v.share for v in nodes], terms)
+    adds = terms > 1 and rounding.outward() and share is None
 
     def as_list(result: Any) -> list[Any]:
         return list(result) if isinstance(result, list | tuple) else [result]
@@ -108,7 +112,7 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
             entering = run(along, *(((v.lower != 0) | (v.upper != 0)).astype(dtype) for v in parts_of))
             jacs = [sparse(found, Interval.unchecked(entering, entering)) for found in jacs]
     unnormalised = rounding.outward() and (adds or any(v.unnormalised for v in nodes))
-    return [Node(*triple, unnormalised) for triple in zip(ranges, forms, jacs, strict=True)]
+    return [Node(*triple, unnormalised, share) for triple in zip(ranges, forms, jacs, strict=True)]
 
 
 def _jac_like(node: Node, jac: Interval) -> Interval:
@@ -160,7 +164,21 @@ def multiple(factor: Any, x: Node, rounded: bool = False) -> Node:
         if form.is_static_affine():
             return unnormalised_node(None, form, jac)
         form = None if POINT_MODE.get() else form
+    if form is None and (found := _combination(factor, x, ulps)) is not None:
+        return unnormalised_node(*found[:1], None, jac, found[1])
     return unnormalised_node(scaled(factor, x.range, ulps), form, jac)
+
+
+def _combination(factor: Any, x: Node, ulps: float) -> tuple[Interval, combinations.Share | None] | None:
+    """Range of ``factor * x`` as part of a linear combination; None where it has a widening of its own."""
+    if not (rounding.outward() and is_known(factor) and np.isfinite(factor).all()) or is_point(x.range):
+        return None
+    if ulps == 2.0 and is_exact(factor):
+        return (combinations.scaled(factor, x.range), combinations.times(factor, x.share, ulps)) if x.share else None
+    share = combinations.times(np.asarray(factor), x.share, ulps)
+    if share is None:
+        return None
+    return combinations.scaled(factor, x.range if x.share else combinations.widened(x.range)), share
 
 
 def negative(x: Node) -> Node:
@@ -169,9 +187,8 @@ def negative(x: Node) -> Node:
         return Interval.unchecked(lower, lower if is_point(a) else -a.lower)
 
     form = None if x.form is None else Form(-x.form.slope, flip(x.form.offset), x.form.box, x.form.slack)
-    return Node(
-        None if x.given is None else flip(x.given), form, None if x.jac is None else flip(x.jac), x.unnormalised
-    )
+    jac = None if x.jac is None else flip(x.jac)
+    return Node(None if x.given is None else flip(x.given), form, jac, x.unnormalised, x.share)
 
 
 def add(x: Any, y: Any) -> Node:
@@ -183,6 +200,9 @@ def add(x: Any, y: Any) -> Node:
     form, jac = x.form if y.form is None else y.form, join(x.jac, y.jac)
     if form is not None and x.is_static_affine and y.is_static_affine:
         return _known_sum(x, y, form.box, jac)
+    if form is None and (share := _shares(x, y)) is not None:
+        one, other = (v.range if v.share else combinations.widened(v.range) for v in (x, y))
+        return unnormalised_node(combinations.added(one, other), None, jac, share)
     total = box_sum(x.range, y.range)
     if form is None or POINT_MODE.get():
         return unnormalised_node(total, None, jac)
@@ -193,6 +213,13 @@ def add(x: Any, y: Any) -> Node:
     slope = x.form.slope + y.form.slope
     slack = sum_slack(x.form.slack, y.form.slack, added_slack(x.form.slope, y.form.slope, slope))
     return meet(unnormalised_node(total, Form(slope, offset, form.box, slack), jac))
+
+
+def _shares(x: Node, y: Node) -> combinations.Share | None:
+    """Of the sum as a linear combination, if one of its terms is one."""
+    if (x.share is None and y.share is None) or is_zero(x.range) or is_zero(y.range):
+        return None
+    return combinations.plus(x.share or combinations.OPERAND, y.share or combinations.OPERAND)
 
 
 def _known_sum(x: Node, y: Node, box: Any, jac: Any) -> Node:

@@ -116,7 +116,9 @@ def _share(x: Any, rest: Any, ulps: float, side: float) -> Any:
     size = _length(jnp.stack([abs(x), rest]))
     usual = (size > 0) & (size < jnp.inf)
     unit = _unit(jnp.where(usual, size, 1))
-    value = jnp.where(usual, x, 0) * unit / (jnp.where(usual, size, 1) * unit)
+    # Small ones are made larger before they are divided, large ones smaller afterwards: an x far below its size would
+    # be flushed to zero before it is divided.
+    value = jnp.where(usual, x, 0) * jnp.maximum(unit, 1) / (jnp.where(usual, size, 1) * unit) * jnp.minimum(unit, 1)
     value = jnp.where(size == jnp.inf, jnp.where(jnp.isfinite(x), jnp.where(x * side > 0, side, 0), jnp.sign(x)), value)
     value = rounding.up(value, ulps + 8) if side > 0 else rounding.down(value, ulps + 8)
     return jnp.clip(value, -1, 1)
