@@ -110,7 +110,7 @@ def measured(task: Task) -> list[list[str]]:
             continue
         run = jax.jit(jax.vmap(lambda box, y, observer=observer: gx.estimate(observer, box, y, task.u).state.width))
         width = np.asarray(run(task.initial, task.y))[:, task.y.shape[1] // 2 :].mean((0, 1))
-        found[sizes] = said, design, _operations(observer, task), run, width
+        found[sizes] = said, design, operations_of(observer, task), run, width
     times = _in_turns([run for *_, run, _ in found.values()], task)
     base = next(iter(found.values()))[-1]
     lines = []
@@ -130,7 +130,7 @@ def _sizes(observer: Any) -> tuple[int, ...]:
     return (1 if inner.window is None else inner.window.length, rows, len(inner.gains.residual), cells)
 
 
-def _operations(observer: Any, task: Task) -> int:
+def operations_of(observer: Any, task: Task) -> int:
     """Of one step; of a delayed observer, that of the lifted plant."""
     inner = getattr(observer, "inner", observer)
     box = jax.tree.map(lambda side: jax.numpy.asarray(side[0]), task.initial)

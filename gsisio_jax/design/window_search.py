@@ -82,7 +82,7 @@ class Search:
 
     def begins_narrower(self, kept: list[int]) -> bool:
         """Whether these rows close wide boxes so much sooner that they are worth their operations ever after."""
-        if not kept:
+        if not kept or not np.isfinite(self.start).all():
             return False
         now, best = (self._first_steps(self.with_gains(rows)) for rows in ([], kept))
         return bool((mean_log_width(best) < mean_log_width(now) + np.log(1 - _WORTH_EARLY)).any())
