@@ -104,8 +104,8 @@ def cut_up(box: Interval, parts: tuple[int, ...]) -> tuple[Any, Any]:
 
 
 def _cut(lower: Any, upper: Any, count: int) -> tuple[Any, Any]:
-    """Lower and upper ends of the cells along one state, that share their edges. Where the box is infinite every cell is
-    all of it: there is no share of an infinite length."""
+    """Lower and upper ends of the cells along one state, which share their edges. Where the box is infinite every cell
+    is all of it: there is no share of an infinite length."""
     share = (np.arange(1, count) / count).astype(lower.dtype)
     inner = jnp.clip(lower + (upper - lower) * share, lower, upper)
     edges, finite = jnp.concatenate([lower[None], inner, upper[None]]), jnp.isfinite(upper - lower)
