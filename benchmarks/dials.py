@@ -20,7 +20,7 @@ import numpy as np
 import gsisio_jax as gx
 from benchmarks.cells import operations
 from benchmarks.plants import case, records
-from benchmarks.record import keep, line, title
+from benchmarks.record import keep_rows, line, title
 from benchmarks.tightness import PLANTS, Plant
 from gsisio_jax.observer.step import blank
 
@@ -91,8 +91,7 @@ def main(names: list[str]) -> int:
         for cells in measured(TASKS[name]()):
             rows.append([name, *cells])
             print(line(rows[-1]), flush=True)
-    if not names:
-        keep("dials", head, rows)
+    keep_rows("dials", head, rows, list(TASKS))
     return 0
 
 

@@ -23,6 +23,25 @@ def keep(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], **more: 
     (RESULTS / f"{name}.json").write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
+def keep_rows(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], order: Sequence[str]) -> None:
+    """`keep` of a part of a table: rows of other names, the first cell, stay as they are; a note says from when.
+
+    Args:
+        name, head, rows: as in `keep`.
+        order: of the names.
+    """
+    file, new = RESULTS / f"{name}.json", {row[0] for row in rows}
+    before = json.loads(file.read_text()) if file.exists() else {"rows": []}
+    stay = [row for row in before["rows"] if row[0] not in new and row[0] in order]
+    keep(name, head, sorted([*map(list, rows), *stay], key=lambda row: order.index(row[0])))
+    if stay:
+        found = json.loads(file.read_text())
+        others = ", ".join(dict.fromkeys(row[0] for row in stay))
+        old = before["setting"]
+        found["setting"]["note"] = f"{others}: commit {old['commit']}, {old['date']}"
+        file.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
 def line(cells: Sequence[str]) -> str:
     """A row of Markdown."""
     return f"| {' | '.join(cells)} |"

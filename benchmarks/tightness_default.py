@@ -105,7 +105,7 @@ def measured(plant: Plant, name: str) -> dict[str, Any]:
     system = gx.System(lambda x: plant.A @ x, lambda x: plant.C @ x, G=plant.G, H=plant.H)
     noise, region = gx.Noise(ball(plant.w), ball(plant.v)), gx.Interval.entire(len(plant.A))
     late: dict[str, Any] = {"delay": "auto"} if name == "spring, Euler" else {}
-    drawn = {vertices: [_record(plant, seed, vertices) for seed in range(RECORDS)] for vertices in (False, True)}
+    drawn = {vertices: [drawn_noise(plant, seed, vertices) for seed in range(RECORDS)] for vertices in (False, True)}
     hulls: dict[bool, np.ndarray] = {}
     sizes = len(plant.A), len(plant.C), plant.G.shape[1]
     found: dict[str, Any] = {"sizes": sizes}
@@ -119,7 +119,7 @@ def measured(plant: Plant, name: str) -> dict[str, Any]:
             widths = []
             for slow in (False, True):
                 x, y = (
-                    np.stack(part) for part in zip(*(_seen(plant, *one, slow) for one in drawn[vertices]), strict=True)
+                    np.stack(part) for part in zip(*(run_of(plant, *one, slow) for one in drawn[vertices]), strict=True)
                 )
                 box = run(y)
                 rounding = 1e-12 * (1 + np.abs(x))  # of the record itself
@@ -139,7 +139,7 @@ def measured(plant: Plant, name: str) -> dict[str, Any]:
     return found
 
 
-def _record(plant: Plant, seed: int, vertices: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def drawn_noise(plant: Plant, seed: int, vertices: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The first state, w (T, n) and v (T, l)."""
     rng = np.random.default_rng(seed)
 
@@ -150,7 +150,7 @@ def _record(plant: Plant, seed: int, vertices: bool) -> tuple[np.ndarray, np.nda
     return draw(plant.start, 1)[0], draw(plant.w, STEPS), draw(plant.v, STEPS)
 
 
-def _seen(plant: Plant, first: np.ndarray, w: np.ndarray, v: np.ndarray, slow: bool) -> tuple[np.ndarray, np.ndarray]:
+def run_of(plant: Plant, first: np.ndarray, w: np.ndarray, v: np.ndarray, slow: bool) -> tuple[np.ndarray, np.ndarray]:
     """States and measurements, with inputs white or slow."""
     d = 3.0 * np.random.default_rng(99).standard_normal((STEPS, plant.G.shape[1]))
     d = np.cumsum(0.05 * d, 0) if slow else d
