@@ -91,7 +91,7 @@ def main(names: list[str]) -> int:
         for cells in measured(TASKS[name]()):
             rows.append([name, *cells])
             print(line(rows[-1]), flush=True)
-    keep_rows("dials", head, rows, list(TASKS))
+        keep_rows("dials", head, rows, list(TASKS))
     return 0
 
 
