@@ -27,14 +27,10 @@ def error_hulls(plant: Any, noise: list[tuple[np.ndarray, np.ndarray, np.ndarray
     """
     n, s = len(plant.A), step + later + 1
     before, after = sparse.eye_array(s - 1, s), sparse.eye_array(s - 1, s, k=1)
-    moves = sparse.hstack(
-        [
-            sparse.kron(after, np.eye(n)) - sparse.kron(before, plant.A), 
-            -sparse.kron(sparse.eye_array(s - 1, s), plant.G),
-        ]
-    )  # fmt: skip
+    along = sparse.kron(after, np.eye(n)) - sparse.kron(before, plant.A)
+    moves = sparse.hstack([along, -sparse.kron(sparse.eye_array(s - 1, s), plant.G)])
     sees = sparse.hstack([sparse.kron(sparse.eye_array(s), plant.C), sparse.kron(sparse.eye_array(s), plant.H)])
-    matrix = sparse.csc_array(sparse.vstack([moves, sees]))
+    matrix: Any = sparse.csc_array(sparse.vstack([moves, sees]))
     columns = matrix.shape[1]
     solver = _solver(matrix)
     numbers = np.arange(max(matrix.shape), dtype=np.int32)

@@ -31,7 +31,7 @@ def keep_rows(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], ord
         order: of the names.
     """
     file, new = RESULTS / f"{name}.json", {row[0] for row in rows}
-    before = json.loads(file.read_text()) if file.exists() else {"rows": []}
+    before: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"rows": []}
     stay = [row for row in before["rows"] if row[0] not in new and row[0] in order]
     when = {row[0]: before.get("when", {}).get(row[0], _when(before["setting"])) for row in stay}
     keep(name, head, sorted([*map(list, rows), *stay], key=lambda row: order.index(row[0])), when=when)

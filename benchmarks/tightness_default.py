@@ -109,7 +109,8 @@ def measured(plant: Plant, name: str) -> dict[str, Any]:
     hulls: dict[bool, np.ndarray] = {}
     sizes = len(plant.A), len(plant.C), plant.G.shape[1]
     found: dict[str, Any] = {"sizes": sizes}
-    for label, dials in (("default", {}), ("one", {"window": 1})):
+    designs: tuple[tuple[str, dict[str, Any]], ...] = (("default", {}), ("one", {"window": 1}))
+    for label, dials in designs:
         observer = gx.design_observer(system, noise, region, missing=False, **late, **dials)
         inner, delay = getattr(observer, "inner", observer), getattr(observer, "delay", 0)
         run = jax.jit(jax.vmap(lambda y, of=observer: gx.estimate(of, ball(plant.start), y).state))
