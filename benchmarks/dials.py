@@ -20,7 +20,7 @@ import numpy as np
 import gsisio_jax as gx
 from benchmarks.cells import operations
 from benchmarks.plants import case, records
-from benchmarks.record import keep, line, title
+from benchmarks.record import keep_rows, line, title
 from benchmarks.tightness import PLANTS, Plant
 from gsisio_jax.observer.step import blank
 
@@ -91,8 +91,7 @@ def main(names: list[str]) -> int:
         for cells in measured(TASKS[name]()):
             rows.append([name, *cells])
             print(line(rows[-1]), flush=True)
-    if not names:
-        keep("dials", head, rows)
+        keep_rows("dials", head, rows, list(TASKS))
     return 0
 
 
@@ -110,7 +109,7 @@ def measured(task: Task) -> list[list[str]]:
             continue
         run = jax.jit(jax.vmap(lambda box, y, observer=observer: gx.estimate(observer, box, y, task.u).state.width))
         width = np.asarray(run(task.initial, task.y))[:, task.y.shape[1] // 2 :].mean((0, 1))
-        found[sizes] = said, design, _operations(observer, task), run, width
+        found[sizes] = said, design, operations_of(observer, task), run, width
     times = _in_turns([run for *_, run, _ in found.values()], task)
     base = next(iter(found.values()))[-1]
     lines = []
@@ -130,7 +129,7 @@ def _sizes(observer: Any) -> tuple[int, ...]:
     return (1 if inner.window is None else inner.window.length, rows, len(inner.gains.residual), cells)
 
 
-def _operations(observer: Any, task: Task) -> int:
+def operations_of(observer: Any, task: Task) -> int:
     """Of one step; of a delayed observer, that of the lifted plant."""
     inner = getattr(observer, "inner", observer)
     box = jax.tree.map(lambda side: jax.numpy.asarray(side[0]), task.initial)

@@ -23,6 +23,29 @@ def keep(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], **more: 
     (RESULTS / f"{name}.json").write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
+def keep_rows(name: str, head: Sequence[str], rows: Sequence[Sequence[str]], order: Sequence[str]) -> None:
+    """`keep` of a part of a table: rows of other names, the first cell, stay as they are; a note says from when.
+
+    Args:
+        name, head, rows: as in `keep`.
+        order: of the names.
+    """
+    file, new = RESULTS / f"{name}.json", {row[0] for row in rows}
+    before: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"rows": []}
+    stay = [row for row in before["rows"] if row[0] not in new and row[0] in order]
+    when = {row[0]: before.get("when", {}).get(row[0], _when(before["setting"])) for row in stay}
+    keep(name, head, sorted([*map(list, rows), *stay], key=lambda row: order.index(row[0])), when=when)
+    if when:
+        found = json.loads(file.read_text())
+        of = {one: ", ".join(other for other, at in when.items() if at == one) for one in dict.fromkeys(when.values())}
+        found["setting"]["note"] = "; ".join(f"{names}: {one}" for one, names in of.items())
+        file.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _when(setting: dict[str, Any]) -> str:
+    return f"commit {setting['commit']}, {setting['date']}"
+
+
 def line(cells: Sequence[str]) -> str:
     """A row of Markdown."""
     return f"| {' | '.join(cells)} |"

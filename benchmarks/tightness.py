@@ -22,7 +22,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from benchmarks.plants import from_tests
-from benchmarks.record import keep, line
+from benchmarks.record import keep
 
 STEPS, FROM = 30, 15
 
@@ -126,10 +126,7 @@ def main() -> int:
     parser.add_argument("--gains", type=_dial, nargs="+", default=[1])
     parser.add_argument("--records", type=int, default=3)
     parser.add_argument("--only", default="")
-    parser.add_argument("--default", action="store_true", help="the default only, median and worst state")
     options = parser.parse_args()
-    if options.default:
-        return by_default(options.only, options.records)
     table = {}
     for name, make in PLANTS.items():
         if options.only in name:
@@ -139,21 +136,6 @@ def main() -> int:
                 print(f"  {dials}: " + ", ".join(f"{key} {value}" for key, value in row.items()), flush=True)
     head = "Plant", "window", "gains", "ratios, least to most", "rows", "design s", "µs a step and box"
     keep("tightness", head, [_cells(name, row) for name, rows in table.items() for row in rows.values()], table=table)
-    return 0
-
-
-def by_default(only: str, records: int) -> int:
-    """What `design_observer` does when it is asked for nothing."""
-    head, rows, table = ("Plant", "window, rows", "uniform", "vertices"), [], {}
-    for name, make in PLANTS.items():
-        if only not in name:
-            continue
-        (row,) = measured(make(), ["auto"], [1], records).values()
-        ratios = [f"{np.median(row[kind]):.3f}, {max(row[kind]):.3f}" for kind in ("uniform", "vertices")]
-        rows.append([name.replace("_", " "), f"{row['length']}, {row['rows']}", *ratios])
-        table[name] = row
-        print(line(rows[-1]), flush=True)
-    keep("tightness_default", head, rows, table=table)
     return 0
 
 

@@ -35,7 +35,7 @@ from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.progress import Say
 from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.region import find_region, grown_around
-from gsisio_jax.design.slices import with_slices
+from gsisio_jax.design.slices import what_split_gives, with_slices
 from gsisio_jax.design.tolerant import Guessed, tolerant
 from gsisio_jax.design.undefined import undefined_in
 from gsisio_jax.design.window_with_less import window_rows_with_less
@@ -132,6 +132,10 @@ def design_current(
         weights = np.asarray(observer.gains.residual[0])
         certificate = with_slices(observer.certificate, noise, weights, on.slopes, box, dials.split)
         observer = replace(observer, certificate=certificate)
+    elif dials.certify and observer.certificate.certified and not observer.certificate.self_consistent:
+        weights = np.asarray(observer.gains.residual[0])
+        way = "" if everywhere.affine else what_split_gives(observer.certificate, noise, weights, on.slopes, box)
+        observer = replace(observer, certificate=observer.certificate.with_notes(way))
     if not (first.uncertified or observer.certificate.certified):
         way = what_settles(plan, on, box)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))

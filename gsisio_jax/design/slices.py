@@ -64,6 +64,25 @@ def with_slices(
     return best
 
 
+def what_split_gives(
+    certificate: Certificate,
+    noise: Noise,
+    weights: np.ndarray,
+    slopes_on: Callable[[Interval], Slopes],
+    region: Interval,
+) -> str:
+    """For an empty certificate: that a few slices would make it say something, as a note; "" where they do not. More
+    are not tried, as every design with an empty certificate would wait for them."""
+    found = with_slices(certificate, noise, weights, slopes_on, region, _COUNTS[0])
+    if found.slices is None or not found.self_consistent:
+        return ""
+    widths = ", ".join(f"{width:.3g}" for width in np.asarray(found.steady_width))
+    return (
+        f"with split={_COUNTS[0]} it is not empty: slopes count part by part of the region, and widths settle at or "
+        f"below {widths}"
+    )
+
+
 def _even_edges(slopes: Slopes, region: Interval, count: int) -> np.ndarray:
     """Edges of slices of one length, for the states along which slopes may vary; one slice for all others."""
     lower, upper = (np.asarray(side, np.float64) for side in (region.lower, region.upper))

@@ -18,6 +18,7 @@ from gsisio_jax.observer.window import Window
 
 _ROUNDS = 4  # of runs, each with all rows so far
 _TRIED = (3, 5)  # windows that "auto" looks at
+_THINNER = (16, 8, 4, 2)  # rows a state that are tried, the first ones of a bank, where all cost more than they bring
 _MOST_STATES = 10  # beyond, the programs of "auto" would take too long
 
 
@@ -72,9 +73,19 @@ def _worth_it(
         if search.could_bring(longer, kept, steps):
             steps = longer
     kept = search.collected(steps, _ROUNDS - 1)
-    narrower = search.widths(kept) < (1 - WORTH) * search.widths([])
-    settles = search.settled(search.with_gains(kept)) < (1 - WORTH) * search.settled(search.with_gains([]))
-    return (search.rows, kept) if (narrower | settles).any() or search.begins_narrower(kept) else None
+    if search.brings(kept) > WORTH:
+        for most in _THINNER:
+            fewer = search.first_of_each(kept, most)
+            if search.brings(fewer) > WORTH * worth_of_time(search.cost(fewer)):
+                return search.rows, fewer
+    return (search.rows, kept) if search.begins_narrower(kept) else None
+
+
+def worth_of_time(cost: float) -> float:
+    """How much more than `WORTH` a bank must bring that makes a step `cost` times as long: once for half as much again,
+    twice for twice as much. Proportional to the time that it adds, and more where a step takes longer than that: what
+    runs promise is not kept to the last per cent, and no step may be slower than twice for less than `WORTH`."""
+    return (cost - 1) * cost
 
 
 def as_window(

@@ -20,6 +20,8 @@ _WORTH_EARLY = 0.2  # share of the width there that a window must bring, which c
 _LEAST_EARLY = 1e-2  # share of the width there that one more row must bring
 _LOOKS = 8  # steps for which "auto" asks what a window could bring
 _SETTLING = 300  # rounds of widths, at most
+_GAIN_LAGS = 8  # rows of a window that cost as much as a row of a gain, for every step that they look back
+_CARRIED = 0.2  # share of the time of a step that the bounds of older steps cost, however few the rows
 _SMALL_STATES = 6  # up to so many all samples are taken; beyond fewer, as there are more and larger programs a sample
 
 
@@ -36,6 +38,7 @@ class Search:
         self.rng = np.random.default_rng(seed)
         self.rows = rows_of_gains(problem, gains, length)
         self.own = len(self.rows.parts)
+        self.gains = len(gains)
         self.half = np.full(problem.n, 0.5)
 
     def runs(self, seed: int) -> Runs:
@@ -79,7 +82,7 @@ class Search:
 
     def begins_narrower(self, kept: list[int]) -> bool:
         """Whether these rows close wide boxes so much sooner that they are worth their operations ever after."""
-        if not kept:
+        if not kept or not np.isfinite(self.start).all():
             return False
         now, best = (self._first_steps(self.with_gains(rows)) for rows in ([], kept))
         return bool((mean_log_width(best) < mean_log_width(now) + np.log(1 - _WORTH_EARLY)).any())
@@ -143,6 +146,36 @@ class Search:
         has some component of it cuts half of a box away."""
         runs = self.runs(self.seed + 1).of(self.with_gains(kept), False)
         return np.mean([below + above for _, _, below, above in runs[-8:]], (0, 1))
+
+    def brings(self, kept: list[int]) -> float:
+        """The largest share of a state's width that these rows take away in runs, or where boxes settle."""
+        before, after = ((self.widths(rows), self.settled(self.with_gains(rows))) for rows in ([], kept))
+        with np.errstate(all="ignore"):
+            shares = 1 - np.array(after) / np.array(before)
+        return float(np.nan_to_num(shares, nan=0.0).max(initial=0.0))
+
+    def cost(self, kept: list[int]) -> float:
+        """About how many times as long a step takes with these rows: as measured, f and g linear."""
+        lags = sum(self.looks_back(self.rows.parts[r]) for r in kept)
+        return 1 + _CARRIED + lags / (_GAIN_LAGS * self.problem.n * self.gains)
+
+    def looks_back(self, parts: np.ndarray) -> int:
+        """How many steps a row looks back."""
+        n, l, N = self.problem.n, self.problem.l, self.length
+        of_f, of_g = parts[N * n : 2 * N * n].reshape(N, n), parts[2 * N * n : N * (2 * n + l)].reshape(N, l)
+        used = of_f.any(1) | of_g.any(1)
+        return N - int(np.argmax(used)) if used.any() else 0
+
+    def first_of_each(self, kept: list[int], most: int) -> list[int]:
+        """So many rows of every state at most, those that help most."""
+        seen = [0] * self.problem.n
+        found = []
+        for r in kept:
+            state = self.rows.states[r]
+            seen[state] += 1
+            if seen[state] <= most:
+                found.append(r)
+        return found
 
     def with_gains(self, kept: list[int]) -> Rows:
         return self.rows.kept([*range(self.own), *kept])

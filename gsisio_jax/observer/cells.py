@@ -98,17 +98,18 @@ def _met(cell: Interval, boxes: Interval) -> tuple[Interval, Any]:
 def cut_up(box: Interval, parts: tuple[int, ...]) -> tuple[Any, Any]:
     """Lower and upper corners (cells, n)."""
     places = np.array(list(itertools.product(*map(range, parts))))
-    edges = [_edges(box.lower[i], box.upper[i], count) for i, count in enumerate(parts)]
-    lower = jnp.stack([edge[places[:, i]] for i, edge in enumerate(edges)], -1)
-    return lower, jnp.stack([edge[places[:, i] + 1] for i, edge in enumerate(edges)], -1)
+    sides = [_cut(box.lower[i], box.upper[i], count) for i, count in enumerate(parts)]
+    lower, upper = (jnp.stack([side[k][places[:, i]] for i, side in enumerate(sides)], -1) for k in (0, 1))
+    return lower, upper
 
 
-def _edges(lower: Any, upper: Any, count: int) -> Any:
-    """Edges of the cells along one state, increasing; the ends are those of the box. The first cell of an infinite
-    box is all of it, and so are the others."""
+def _cut(lower: Any, upper: Any, count: int) -> tuple[Any, Any]:
+    """Lower and upper ends of the cells along one state, which share their edges. Where the box is infinite every cell
+    is all of it: there is no share of an infinite length."""
     share = (np.arange(1, count) / count).astype(lower.dtype)
     inner = jnp.clip(lower + (upper - lower) * share, lower, upper)
-    return jnp.concatenate([lower[None], inner, upper[None]])
+    edges, finite = jnp.concatenate([lower[None], inner, upper[None]]), jnp.isfinite(upper - lower)
+    return jnp.where(finite, edges[:-1], lower), jnp.where(finite, edges[1:], upper)
 
 
 def hull(boxes: Interval, alive: Any) -> tuple[Interval, Any]:

@@ -5,8 +5,11 @@ import pytest
 import systems
 
 import gsisio_jax as gx
+from benchmarks import dials
+from benchmarks.tightness import PLANTS
 from gsisio_jax import Interval
 from gsisio_jax.design.gain_growth import grown
+from gsisio_jax.design.window_search import Search
 
 AUTO = {"missing": False, "window": "auto"}
 
@@ -31,6 +34,42 @@ def test_the_default_looks_for_a_window():
     one = gx.design_observer(system, noise, Interval.entire(2), missing=False, window=1)
     assert default.window is not None
     assert default.certificate.steady_width[1] < 0.8 * one.certificate.steady_width[1]
+
+
+def _costs(monkeypatch, cost):
+    """Makes the design take that for how many times as long a step takes, given what it would have taken."""
+    asked = []
+    own = Search.cost
+
+    def told(search, kept):
+        asked.append(own(search, kept))
+        return cost(asked[-1])
+
+    monkeypatch.setattr(Search, "cost", told)
+    return asked
+
+
+@pytest.mark.parametrize("name", ["rotation", "full_rank"])
+def test_a_step_costs_about_what_the_design_thinks(name, monkeypatch):
+    """By the numbers that it computes; the rest is for the older steps in the carry, which take time and no numbers."""
+    asked = _costs(monkeypatch, lambda cost: cost)
+    task = dials.linear(PLANTS[name]())
+    one, chosen = (dials.operations_of(task.design(**options), task) for options in ({"window": 1}, {}))
+    assert 1 < chosen / one < asked[-1] < 1.25 * chosen / one
+
+
+def test_a_window_is_thinned_to_what_its_time_is_worth(monkeypatch):
+    """All rows bring full_rank five per cent and take twice the time."""
+    asked = _costs(monkeypatch, lambda cost: cost)
+    task = dials.linear(PLANTS["full_rank"]())
+    rows = [len(task.design().window.targets)]
+    assert asked[0] > 2
+    assert asked[-1] < 1.7
+    _costs(monkeypatch, lambda cost: 1.1)
+    rows.append(len(task.design().window.targets))
+    assert rows[0] <= 15 < rows[1]
+    _costs(monkeypatch, lambda cost: 3.0)
+    assert task.design().window is None
 
 
 @pytest.mark.parametrize(("shares", "count"), [([0.5, 0.2, 0.1, 0.004, 0.5], 4), ([0.009], 1), ([], 1)])

@@ -43,6 +43,19 @@ def test_the_tank_has_a_certificate_that_is_not_empty(tank, observer):
     np.testing.assert_allclose(width, found.steady_width, rtol=1e-6)
 
 
+def test_an_empty_certificate_says_that_slices_help(tank):
+    """And nothing where they do not, or are there."""
+    empty = tank.design(missing=False, window=1).certificate
+    split = tank.design(missing=False, window=1, split=4).certificate
+    assert not empty.self_consistent
+    assert split.self_consistent
+    widths = ", ".join(f"{width:.3g}" for width in split.steady_width)
+    assert empty.notes[-1].startswith("with split=4 it is not empty: ")
+    assert empty.notes[-1].endswith(widths)
+    assert "split=" not in str(split)
+    assert "split=" not in str(systems.s1(region=(1.0, 1.0)).design(missing=False, window=1).certificate)
+
+
 def test_the_unicycle_has_one_on_its_whole_arena():
     """Positions are no wider than the arena, and the heading is then known to 2.29 rad, whatever it was before."""
     arena = Interval([-6.0, -5.0, -1.2], [4.0, 6.0, 1.2])
