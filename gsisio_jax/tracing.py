@@ -32,6 +32,11 @@ _BY_WORDS = (
     ("out of bounds", "x has one entry per row of G, u one per known input"),
     ("shape", "x has one entry per row of G, u one per known input"),
     ("to unpack", "x has one entry per row of G, u one per known input"),
+    ("converted to a scalar index", "An index, a size or a number of turns cannot depend on x; use jnp.where"),
+    (
+        "unsupported format string",
+        "What depends on x cannot be written as text here; jax.debug.print can",
+    ),
     ("can be converted to Python scalars", "Use jnp (jnp.sin, not math.sin)"),
 )
 

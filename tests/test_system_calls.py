@@ -230,3 +230,19 @@ def test_maps_of_a_system_can_be_compiled():
     assert jax.jit(system.dynamics)(x, u).tolist() == [0.5, 0.5]
     assert jax.jit(system.measurement)(x, u).tolist() == [1.0]
     assert jax.jit(system.maps)(x, u).tolist() == [0.5, 0.5, 1.0]
+
+
+def test_a_table_of_which_jax_mixes_up_the_types_gets_a_remedy(monkeypatch):
+    """JAX keeps the type that a table had while a design computed in float64."""
+    import importlib
+
+    simulation = importlib.import_module("gsisio_jax.plant.simulation")
+
+    def refused(*_):
+        raise ValueError("Cannot lower jaxpr with verifier errors: 'func.call' op operand type mismatch: expected ...")
+
+    system = gx.System(lambda x: x, lambda x: x, [[1.0]], [[0.0]])
+    noise = gx.Noise(gx.Interval([-1.0], [1.0]), gx.Interval([-1.0], [1.0]))
+    monkeypatch.setattr(simulation, "_simulate", refused)
+    with jax.enable_x64(False), pytest.raises(ValueError, match=r"simulate: .*jnp.asarray\(table\)"):
+        gx.simulate(system, 0, np.zeros(1), np.zeros((2, 1)), noise)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -15,6 +14,7 @@ from gsisio_jax.interval.reading import check_type
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.alarms import Alarm, read_alarms
 from gsisio_jax.observer.checks import AnyObserver, check_length, check_on_conflict, normal, prepare
+from gsisio_jax.observer.compiled import compiled
 from gsisio_jax.observer.delayed import DelayedObserver, to_the_end
 from gsisio_jax.observer.fixed import Fixed, chosen, fixed
 from gsisio_jax.observer.scan import advance, begin, blank, cut, once, scan
@@ -245,7 +245,7 @@ def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
     return _as_estimate(observer, jax.tree.map(lambda *x: jnp.concatenate(x), *rows))
 
 
-@partial(jax.jit, static_argnames=("static", "hold"))
+@compiled
 def _estimate(
     static: Fixed | None, traced: Any, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool
 ) -> Estimate:
@@ -257,20 +257,20 @@ def _estimate(
     return _as_estimate(observer, out)
 
 
-@partial(jax.jit, static_argnames=("static", "hold"))
+@compiled
 def _start(static: Fixed | None, traced: Any, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     initial, noise = normal(initial, noise)
     return begin(chosen(static, traced), initial, y, u, noise, hold)
 
 
-@partial(jax.jit, static_argnames=("static", "hold"))
+@compiled
 def _step(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
     _, noise = normal(carry.state, noise)
     return once(observer, lambda c, y, u, noise: advance(observer, c, y, u, noise, hold), carry, y, u, noise)
 
 
-@partial(jax.jit, static_argnames=("static", "hold"))
+@compiled
 def _resume(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     _, noise = normal(carry.state, noise)
     return scan(chosen(static, traced), carry, y, u, noise, hold)

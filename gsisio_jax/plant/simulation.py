@@ -72,7 +72,16 @@ def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = N
                 f"simulate: the noise bounds of `{name}` must have shape ({size},) or ({d.shape[0]}, {size}), got "
                 f"{box.shape}"
             )
-    return _simulate(system, key, x0, d, noise.astype(x0.dtype), u)
+    try:
+        return _simulate(system, key, x0, d, noise.astype(x0.dtype), u)
+    except ValueError as error:
+        if "operand type mismatch" not in str(error) or x0.dtype == np.float64:
+            raise
+        raise ValueError(
+            "simulate: JAX mixes up float64 and float32 where f or g hands a NumPy table (float64) to a function of "
+            "JAX, such as jnp.interp. Make the table an array of JAX, jnp.asarray(table), or use float64 throughout: "
+            "jax.config.update('jax_enable_x64', True) before all else"
+        ) from error
 
 
 def read_key(call: str, key: Any) -> Any:

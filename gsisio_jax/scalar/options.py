@@ -78,10 +78,15 @@ def use_flags() -> None:
         os.environ["XLA_FLAGS"] = wanted
 
 
+def jaxlib_version() -> tuple[int, ...]:
+    """The first two parts."""
+    return tuple(int(part) for part in version("jaxlib").split(".")[:2])
+
+
 @cache
 def _accepted(flags: str) -> bool:
     """XLA ends the process at a flag that it does not know: a version that is not known tries it in another process."""
-    installed = tuple(int(part) for part in version("jaxlib").split(".")[:2])
+    installed = jaxlib_version()
     if installed < KNOWN[1]:
         return installed >= KNOWN[0]
     command = [sys.executable, "-c", "import jax; jax.devices()"]

@@ -157,16 +157,18 @@ class ArrayOperation:
         args, start = [], 0
         for shape, atom in zip(self.shapes, self.eqn.invars, strict=True):
             size = math.prod(shape)
-            entries = [typed(value, atom.aval.dtype) for value in flat[start : start + size]]
-            args.append(
-                entries[0]
-                if shape == ()
-                else jnp.stack(entries).reshape(shape)
-                if entries
-                else jnp.zeros(shape, atom.aval.dtype)
-            )
+            args.append(_stacked(flat[start : start + size], shape, atom.aval.dtype))
             start += size
         return [entry for out in bind(self.eqn, args) for entry in jnp.ravel(out)]
+
+
+def _stacked(entries: Sequence[Any], shape: tuple[int, ...], dtype: Any) -> Any:
+    """An array of the entries. A table of constants is one constant: stacked entry by entry it would take XLA longer
+    than the whole step around it."""
+    if shape and not any(isinstance(entry, jax.Array) for entry in entries):
+        return jnp.asarray(np.array(list(entries), dtype).reshape(shape))
+    numbers = [typed(value, dtype) for value in entries]
+    return jnp.stack(numbers).reshape(shape) if shape else numbers[0]
 
 
 def _entries(graph: Graph, eqn: Any, args: list[Any]) -> np.ndarray:

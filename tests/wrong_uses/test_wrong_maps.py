@@ -18,6 +18,13 @@ MAPS = {
     "np.sin": (plant(lambda x: np.sin(x)), "System: calling f", "jnp.sin, not np.sin"),
     "np in g": (plant(g=lambda x: np.cos(x[:1])), "System: calling g", "jnp.sin, not np.sin"),
     "math": (plant(lambda x: [math.sin(x[0]), x[1]]), "System: calling f", "jnp.sin, not math.sin"),
+    "range": (
+        plant(lambda x: [sum(x[1] for _ in range(x[0])), x[1]]),
+        "System: calling f",
+        "number of turns",
+        "jnp.where",
+    ),
+    "text of x": (plant(lambda x: [float(f"{x[0]:.2f}"), x[1]]), "System: calling f", "jax.debug.print"),
     "float": (plant(lambda x: [float(x[0]), x[1]]), "System: calling f", "float(x)"),
     "item": (plant(lambda x: x * x[0].item()), "System: calling f", "x.item()"),
     "index of x": (plant(lambda x: [(1.0, 2.0)[x[0].astype(int)], x[1]]), "System: calling f", "jnp.take"),
