@@ -63,7 +63,9 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _options() -> dict[str, Any]:
-    """Empty where XLA_FLAGS say otherwise, or this XLA does not have them."""
+    """Empty where XLA_FLAGS say otherwise, this XLA does not have them, or no processor was measured (a GPU)."""
+    if jax.default_backend() != "cpu":
+        return {}
     wanted = FUNCTION if loop_bytes() > XLA_LOOP_BYTES else TASKS
     given = os.environ.get("XLA_FLAGS", "")
     return wanted if not any(name in given for name in wanted) and _knows(wanted) else {}
