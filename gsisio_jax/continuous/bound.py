@@ -88,7 +88,7 @@ class StepError:
                 row = int(np.argwhere(~np.isfinite(rate).all(0))[0, 0])
                 raise ValueError(
                     f"discretize: within a step of dt = {self.h:g} the plant may reach {box_text(around)}, where "
-                    f"f[{row}] has no finite bound; give a region on which f is defined, a smaller one, or a shorter dt"
+                    f"f[{row}] has no finite bound; give a region on which f is defined, more cells, or a shorter dt"
                 )
             return sides.add(x, sides.times(length, rate))
 
