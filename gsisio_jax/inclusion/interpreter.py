@@ -123,7 +123,8 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
         value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
         if name in ("select_n", "mul") and is_node(value):
             value = by_pieces(eqn, args, value, _result, ELEMENTWISE)
-        return normalise(value) if is_node(value) and not value.unnormalised else value
+        product = name in ("mul", "div") and all(map(is_node, args))
+        return normalise(value) if is_node(value) and (product or not value.unnormalised) else value
     raise UnknownPrimitiveError(name)
 
 

@@ -29,7 +29,11 @@ from gsisio_jax.interval.primitives import moderate, times
 
 
 def multiply(x: Any, y: Any) -> Node:
-    """Product; linear if one factor is a constant, else the bilinear envelope around the two centers."""
+    """Product; linear if one factor is a constant, else the bilinear envelope around the two centers.
+
+    A product whose both sides overflow is ``[-inf, NaN]`` until it is normalised: the interpreter does so at once, the
+    next rule where products follow each other inside of one (`jnp.cumprod`, a reduction).
+    """
     if not is_node(x):
         return multiple(x, y)
     if not is_node(y):
@@ -46,7 +50,7 @@ def multiply(x: Any, y: Any) -> Node:
         cx, cy = jnp.where(tame, cx, 0), jnp.where(tame, cy, 0)
         spread = jnp.where(tame, times(_radius(x.range, cx), _radius(y.range, cy)), jnp.inf)
         form = _envelope(x, y, cx, cy, spread, natural, box)
-    node = Node(natural, form, join(chain(y.range, x.jac), chain(x.range, y.jac)))
+    node = Node(natural, form, join(chain(y.range, x.jac), chain(x.range, y.jac)), unnormalised=True)
     return meet(node) if x.form is not None and y.form is not None else node
 
 
