@@ -60,28 +60,36 @@ class Runs:
         """For every step with a whole window, or from the first one: sizes and drifts (S, k) of the parts of a row, and
         the distances to the lower and the upper side (S, n)."""
         P, N, n = self.problem, self.length, self.problem.n
+        looked = Measured(P)
         total = N + _STEPS
         w, v = self._noise(P.dw / 2, total, vertices), self._noise(P.dv / 2, total, vertices)
-        below, above = [np.tile(self.start, (RUNS, 1))], [np.tile(self.start, (RUNS, 1))]
-        parts = rows.matrix()
-        belongs = np.array(rows.states)
-        most = FAR * self.start
-        most[P.bounded_states] = P.ds / 2  # of a state in the middle of its bounds
+        # Of N steps before the first one nothing is known; every block of a step is computed once.
+        start = np.tile(self.start, (RUNS, 1))
+        half, off = np.empty((RUNS, N + total, n)), np.zeros((RUNS, N + total, n))
+        half[:, :N], half[:, N] = FAR * start[:, None], start
+        seen_noise = v @ looked.T2.T
+        of_f, of_g = (np.empty((RUNS, N + total, len(radius))) for radius in (P.dw, P.dv))
+        for block, radius, spread in ((of_f, P.dw, P.F_radius), (of_g, P.dv, P.E_radius)):
+            block[:, : N + 1] = 0.5 * radius + half[:, : N + 1] @ spread.T
+        minus_w, past_v = (np.concatenate([np.zeros_like(noise[:, :N]), noise], 1) for noise in (-w, v))
+        known = np.tile(0.5 * P.dd, (RUNS, N))
+        v_now, nothing = np.broadcast_to(0.5 * P.dv, (RUNS, P.l)), np.zeros((RUNS, P.q + N * len(P.dd)))
+        best = _Best(rows)
+        most = FAR * start
+        most[:, P.bounded_states] = P.ds / 2  # of a state in the middle of its bounds
         found = []
         for k in range(1, total):
-            size, drift = self._terms(below, above, w, v, k)
-            none = np.zeros((RUNS, 0))
-            spread, moved = (size @ np.abs(parts).T, drift @ parts.T) if len(parts) else (none, none)
-            sides = []
-            for sign in (-1, 1):
-                reach = spread + sign * moved
-                best = [reach[:, belongs == i].min(1, initial=np.inf) for i in range(n)]
-                sides.append(np.minimum(np.stack(best, 1), most))
-            sides = measured(P, sides, v[:, k] @ P.T2.T)
-            below.append(sides[0])
-            above.append(sides[1])
+            last = slice(k, k + N)
+            blocks = [block[:, last].reshape(RUNS, -1) for block in (half, of_f, of_g)]
+            size = np.concatenate([*blocks, v_now, half[:, k + N - 1] @ P.R.T, known], 1)
+            blocks = [block[:, last].reshape(RUNS, -1) for block in (off, minus_w, past_v)]
+            drift = np.concatenate([*blocks, v[:, k], nothing], 1)
+            below, above = looked(best.sides(size, drift, most), seen_noise[:, k])
+            half[:, k + N], off[:, k + N] = 0.5 * (above + below), 0.5 * (above - below)
+            of_f[:, k + N] = 0.5 * P.dw + half[:, k + N] @ P.F_radius.T
+            of_g[:, k + N] = 0.5 * P.dv + half[:, k + N] @ P.E_radius.T
             if from_start or k > N + 3:
-                found.append((size, drift, *sides))
+                found.append((size, drift, below, above))
         return found
 
     def _noise(self, radius: np.ndarray, steps: int, vertices: bool) -> np.ndarray:
@@ -89,44 +97,55 @@ class Runs:
         unit = self.rng.choice([-1.0, 1.0], shape) if vertices else self.rng.uniform(-1, 1, shape)
         return radius * unit
 
-    def _terms(self, below: list, above: list, w: np.ndarray, v: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
-        P, N, n = self.problem, self.length, self.problem.n
-        unknown = np.zeros((RUNS, n)), np.tile(FAR * self.start, (RUNS, 1))
-        boxes = [
-            (0.5 * (above[j] - below[j]), 0.5 * (above[j] + below[j])) if j >= 0 else unknown for j in range(k - N, k)
-        ]
-        off, half = [box[0] for box in boxes], [box[1] for box in boxes]
-        none_w, none_v = np.zeros((RUNS, n)), np.zeros((RUNS, P.l))
-        drift = [
-            *off,
-            *(-w[:, j] if j >= 0 else none_w for j in range(k - N, k)),
-            *(v[:, j] if j >= 0 else none_v for j in range(k - N, k)),
-            v[:, k],
-            np.zeros((RUNS, P.q + N * len(P.dd))),
-        ]
-        return sizes_of_parts(P, half), np.concatenate(drift, 1)
+
+class _Best:
+    """Rows in the order of their states, to say the best one of each."""
+
+    def __init__(self, rows: Rows):
+        order = np.argsort(rows.states, kind="stable")
+        self.parts = rows.matrix()[order]
+        self.sizes = np.abs(self.parts).T
+        self.states, self.first = np.unique(np.array(rows.states, int)[order], return_index=True)
+
+    def sides(self, size: np.ndarray, drift: np.ndarray, most: np.ndarray) -> list[np.ndarray]:
+        """Distances (S, n) of both sides, at most `most`."""
+        sides = [most.copy(), most.copy()]
+        if len(self.parts):
+            spread, moved = size @ self.sizes, drift @ self.parts.T
+            for side, reach in zip(sides, (spread - moved, spread + moved), strict=True):
+                least = np.minimum.reduceat(reach, self.first, axis=1)
+                side[:, self.states] = np.minimum(least, side[:, self.states])
+        return sides
 
 
-def measured(problem: GainProblem, sides: list[np.ndarray], noise: np.ndarray) -> list[np.ndarray]:
-    """Distances of the sides (S, n) once every output of T2 alone has been solved for every state, as each step does.
+class Measured:
+    """Distances of the sides of boxes once every output of T2 alone has been solved for every state, as each step does.
 
     Args:
         problem: in some units.
-        sides: distances to the lower and the upper side.
-        noise: T2 v of the step, (S, q).
     """
-    C, below, above = problem.C[: problem.q], *(side.copy() for side in sides)
-    radius = 0.5 * np.abs(problem.T2) @ problem.dv
-    for j, i in np.argwhere(C):
-        others = np.where(np.arange(problem.n) == i, 0.0, C[j])
-        plus, minus = np.maximum(others, 0), np.maximum(-others, 0)
-        slack = radius[j] + 0.5 * (below + above) @ problem.R[j]
-        high = below @ plus + above @ minus + slack + noise[:, j]
-        low = above @ plus + below @ minus + slack - noise[:, j]
-        high, low = (high, low) if C[j, i] > 0 else (low, high)
-        above[:, i] = np.minimum(above[:, i], high / abs(C[j, i]))
-        below[:, i] = np.minimum(below[:, i], low / abs(C[j, i]))
-    return [below, above]
+
+    def __init__(self, problem: GainProblem):
+        C = problem.C[: problem.q]
+        radius = 0.5 * np.abs(problem.T2) @ problem.dv
+        self.T2, self._R = problem.T2, problem.R if problem.R.any() else None
+        self._solved = []
+        for j, i in np.argwhere(C):
+            others = np.where(np.arange(problem.n) == i, 0.0, C[j]) / abs(C[j, i])
+            upper_first = C[j, i] > 0
+            self._solved.append((j, i, np.maximum(others, 0), np.maximum(-others, 0), radius[j], C[j, i], upper_first))
+
+    def __call__(self, sides: list[np.ndarray], noise: np.ndarray) -> list[np.ndarray]:
+        """`sides`: distances (S, n) to the lower and the upper side, which are overwritten; `noise`: T2 v, (S, q)."""
+        below, above = sides
+        for j, i, plus, minus, radius, own, upper_first in self._solved:
+            slack = radius if self._R is None else radius + 0.5 * (below + above) @ self._R[j]
+            high = below @ plus + above @ minus + (slack + noise[:, j]) / abs(own)
+            low = above @ plus + below @ minus + (slack - noise[:, j]) / abs(own)
+            high, low = (high, low) if upper_first else (low, high)
+            np.minimum(above[:, i], high, out=above[:, i])
+            np.minimum(below[:, i], low, out=below[:, i])
+        return [below, above]
 
 
 def sizes_of_parts(problem: GainProblem, half: list[np.ndarray]) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window_program import WindowProgram, rows_of_gains
-from gsisio_jax.design.window_runs import FAR, RUNS, Rows, Runs, mean_log_width, measured, sizes_of_parts
+from gsisio_jax.design.window_runs import FAR, RUNS, Measured, Rows, Runs, mean_log_width, sizes_of_parts
 
 WORTH = 0.05  # share of the width of some state that a window must bring to be worth its operations
 _SAMPLES = 6  # steps of a round of runs for which exact rows are asked
@@ -131,12 +131,12 @@ class Search:
     def settled(self, rows: Rows) -> np.ndarray:
         """Half the widths (n,) that boxes settle at or below, if they begin at the units of the problem."""
         parts, states = np.abs(rows.matrix()), np.array(rows.states)
-        half = np.full(self.problem.n, 0.5)
+        half, looked = np.full(self.problem.n, 0.5), Measured(self.problem)
         for _ in range(_SETTLING if len(parts) else 0):
             reach = parts @ sizes_of_parts(self.problem, [half] * self.length)
             least = [reach[states == i].min(initial=np.inf) for i in range(self.problem.n)]
-            sides = [np.minimum(half, least)[None]] * 2
-            half, before = measured(self.problem, sides, np.zeros((1, self.problem.q)))[0][0], half
+            least = np.minimum(half, least)[None]
+            half, before = looked([least.copy(), least], np.zeros((1, self.problem.q)))[0][0], half
             if (before - half <= 1e-4 * before).all():
                 break
         return half
