@@ -117,8 +117,9 @@ def design_current(
         )
     else:
         bank = [main, *profile_bank(problem, main, box, dials.gains - 1)]
-    if dials.missing or system.periodic:  # the multiple of a periodic output is chosen without that output
-        bank.extend(gains_for_missing(problem, main, box, feedthrough, [j for j, _ in system.periodic]))
+    together = [j for j, _ in system.periodic] if dials.missing or system.periodic else None
+    if together is not None:  # the multiple of a periodic output is chosen without that output
+        bank.extend(gains_for_missing(problem, main, box, together))
     guessed = Guessed(problem, main, box, feedthrough, dials.tolerate) if dials.tolerate else None
     if guessed is not None:
         bank.extend(guessed.gains())
@@ -147,7 +148,7 @@ def design_current(
         window = 1
     if window != 1:
         say("choosing rows over several steps")
-        rows = window_rows_with_less(problem, window, width, bank, box)
+        rows = window_rows_with_less(problem, window, width, bank, box, together)
         observer = replace(observer, window=rows)
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)

@@ -7,7 +7,6 @@ from itertools import combinations
 
 import numpy as np
 
-from gsisio_jax.design.feedthrough import Feedthrough
 from gsisio_jax.design.gains import improve, optimal_gain, profile_gain
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.errors import NoDesignFound
@@ -83,7 +82,7 @@ def profile_at(problem: GainProblem, main: np.ndarray, region: Interval, share: 
 
 
 def gains_for_missing(
-    problem: GainProblem, main: np.ndarray, region: Interval, feedthrough: Feedthrough, together: Collection[int] = ()
+    problem: GainProblem, main: np.ndarray, region: Interval, together: Collection[int] = ()
 ) -> list[np.ndarray]:
     """Gains for steps in which y[k-1] or entries of y[k] are missing, also all those `together` (theory 8)."""
     l, q = problem.l, problem.q
@@ -91,7 +90,7 @@ def gains_for_missing(
     steady = problem.steady_width(main)
     typical = np.where(np.isfinite(steady), 4 * units(steady), typical_width(problem, region))
     width = np.where(np.isfinite(width), width, typical)
-    support = feedthrough.T2 != 0
+    support = problem.T2 != 0
     if l <= _MOST_OUTPUTS_FOR_ALL_PATTERNS:
         present = [set(kept) for size in range(l + 1) for kept in combinations(range(l), size)]
     else:

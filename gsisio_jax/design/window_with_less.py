@@ -10,16 +10,27 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsisio_jax.design.gain_selection import distinct, gains_for_missing, main_gain, profile_of
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window import deepest_first, window_rows
+from gsisio_jax.errors import NoDesignFound
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.window import Window
 
 
 def window_rows_with_less(
-    problem: GainProblem, length: int | str, width: np.ndarray, bank: list[np.ndarray], region: Interval
+    problem: GainProblem,
+    length: int | str,
+    width: np.ndarray,
+    bank: list[np.ndarray],
+    region: Interval,
+    missing: list[int] | None,
 ) -> Window | None:
-    """As `window_rows`, with what the same search finds without the bounds of states and inputs."""
+    """As `window_rows`, with what the same search finds without the bounds of states and inputs.
+
+    That begins with the gains and the widths of the design without them: with those of the design it would find other
+    rows. `missing`: the outputs that are missing together (see `gains_for_missing`); None: there are no such gains.
+    """
     own = window_rows(problem, length, width, bank, region)
     if not (len(problem.ds) or len(problem.dd)):
         return own
@@ -27,7 +38,12 @@ def window_rows_with_less(
     free = replace(problem, C=problem.C[: problem.q], ds=np.zeros(0), dd=np.zeros(0), free=everything)
     if np.linalg.matrix_rank(free.seen) < free.seen.shape[1]:
         return own  # there is no observer without the bounds
-    less = window_rows(free, length, width, [N[:, : problem.l + problem.q] for N in bank], region)
+    try:
+        gain = main_gain(free, region)
+    except NoDesignFound:
+        return own
+    gains = [gain] if missing is None else [gain, *gains_for_missing(free, gain, region, missing)]
+    less = window_rows(free, length, profile_of(free, free.steady_width(gain), region), distinct(gains), region)
     return own if less is None else _joined(problem, [less] if own is None else [own, less])
 
 
