@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsisio_jax.design.gain_selection import distinct, gains_for_missing, main_gain, profile_of
+from gsisio_jax.design.gains_without_outputs import gains_without_outputs
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window import deepest_first, window_rows
 from gsisio_jax.errors import NoDesignFound
@@ -43,7 +44,8 @@ def window_rows_with_less(
     except NoDesignFound:
         return own
     gains = [gain] if missing is None else [gain, *gains_for_missing(free, gain, region, missing)]
-    less = window_rows(free, length, profile_of(free, free.steady_width(gain), region), distinct(gains), region)
+    gains = distinct([*gains, *gains_without_outputs(free, distinct(gains), region)])
+    less = window_rows(free, length, profile_of(free, free.steady_width(gain), region), gains, region)
     return own if less is None else _joined(problem, [less] if own is None else [own, less])
 
 
