@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -149,10 +150,17 @@ class Search:
 
     def brings(self, kept: list[int]) -> float:
         """The largest share of a state's width that these rows take away in runs, or where boxes settle."""
-        before, after = ((self.widths(rows), self.settled(self.with_gains(rows))) for rows in ([], kept))
         with np.errstate(all="ignore"):
-            shares = 1 - np.array(after) / np.array(before)
+            shares = 1 - self._typical(kept) / self._by_gains
         return float(np.nan_to_num(shares, nan=0.0).max(initial=0.0))
+
+    @cached_property
+    def _by_gains(self) -> np.ndarray:
+        """With the gains alone: the same for all banks that are compared with them."""
+        return self._typical([])
+
+    def _typical(self, kept: list[int]) -> np.ndarray:
+        return np.array([self.widths(kept), self.settled(self.with_gains(kept))])
 
     def cost(self, kept: list[int]) -> float:
         """About how many times as long a step takes with these rows: as measured, f and g linear."""

@@ -124,7 +124,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
     # then what needs no box to begin with.
     with _stage("initial"):
         first, nothing = FirstForm.of(observer, u), Domain.of(typed(bounds, y.dtype), size)
-        alone = _output(nothing, maps.states(bounds), first.on(bounds), known.z)
+        alone = _from_bounds(maps, nothing, first, known)
         domain = nothing.intersect(everything_unless(carry.starts, before)[None], Source.INITIAL)
         if observer.recovery:
             domain = recovery.contract(observer, domain, carry, y, u, noise)
@@ -191,8 +191,14 @@ def _alone(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> Domain:
     """The box that y[k] and the state bounds alone give, as `_contract` has it."""
     observer, bounds = maps.observer, maps.observer.system.state_bounds
     size = largest_magnitude(y, carry.y, maps.states(carry.state).magnitude)
-    nothing, form = Domain.of(typed(bounds, y.dtype), size), FirstForm.of(observer, u).on(bounds)
-    return _output(nothing, maps.states(bounds), form, _known(observer, carry, y, u, noise).z)
+    nothing = Domain.of(typed(bounds, y.dtype), size)
+    return _from_bounds(maps, nothing, FirstForm.of(observer, u), _known(observer, carry, y, u, noise))
+
+
+def _from_bounds(maps: Maps, nothing: Domain, first: FirstForm, known: Known) -> Domain:
+    """The state bounds contracted with what y[k] says of the outputs."""
+    bounds = maps.observer.system.state_bounds
+    return _output(nothing, maps.states(bounds), first.on(bounds), known.z)
 
 
 def _output(domain: Domain, states: States, form: Affine, z: Interval) -> Domain:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -172,6 +172,19 @@ class Project:
         known = {*before, *self.folder.rglob("*.pyc"), *self.folder.rglob("__pycache__")}
         assert set(self.folder.rglob("*")) <= known
         return err
+
+    def refuses(self, words: Iterable[str], parts: Iterable[str]) -> None:
+        """These words must end with exit code 2 and few lines that hold the parts, and leave every file as it was."""
+        before = {path: path.is_dir() or path.read_bytes() for path in self.folder.rglob("*")}
+        code, out, err = self.run_main(*words)
+        assert (code, out) == (2, ""), (code, out, err)
+        assert err.startswith("gsisio: "), err
+        assert err.count("\n") <= 5, err
+        for part in parts:
+            assert part in err, (part, err)
+        after = {path for path in self.folder.rglob("*") if "__pycache__" not in str(path)}
+        assert after == {path for path in before if "__pycache__" not in str(path)}
+        assert all(found is True or path.read_bytes() == found for path, found in before.items())
 
 
 @pytest.fixture(autouse=True)

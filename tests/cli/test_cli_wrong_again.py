@@ -64,31 +64,20 @@ def here(project, monkeypatch):
     return project
 
 
-def refused(project, words, parts):
-    before = set(project.folder.rglob("*"))
-    code, out, err = project.run_main(*words)
-    assert (code, out) == (2, ""), (code, out, err)
-    assert err.startswith("gsisio: "), err
-    assert err.count("\n") <= 5, err
-    for part in parts:
-        assert part in err, (part, err)
-    assert {path for path in project.folder.rglob("*") if "__pycache__" not in str(path)} <= before
-
-
 @pytest.mark.parametrize(("old", "new", "parts"), EDITS.values(), ids=EDITS)
 def test_a_value_of_the_configuration(here, old, new, parts):
     text = here.config.replace(old, new, 1)
     assert text != here.config
     (here.folder / "cart.toml").write_text(text)
-    refused(here, OUT, parts)
+    here.refuses(OUT, parts)
 
 
 @pytest.mark.parametrize(("content", "parts"), TABLES.values(), ids=TABLES)
 def test_a_table_that_is_none(here, content, parts):
     (here.folder / "cart.csv").write_bytes(content)
-    refused(here, OUT, ["cart.csv", *parts])
+    here.refuses(OUT, ["cart.csv", *parts])
 
 
 @pytest.mark.parametrize(("words", "part"), WORDS.values(), ids=WORDS)
 def test_words_that_do_not_fit(here, words, part):
-    refused(here, words, [part])
+    here.refuses(words, [part])

@@ -49,19 +49,6 @@ WORDS = {
 }
 
 
-def refused(project, words, parts):
-    before = {path: path.is_dir() or path.read_bytes() for path in project.folder.rglob("*")}
-    code, out, err = project.run_main(*words)
-    assert (code, out) == (2, ""), (code, out, err)
-    assert err.startswith("gsisio: "), err
-    assert err.count("\n") <= 5, err
-    for part in parts:
-        assert part in err, (part, err)
-    after = {path for path in project.folder.rglob("*") if "__pycache__" not in str(path)}
-    assert after == {path for path in before if "__pycache__" not in str(path)}
-    assert all(found is True or path.read_bytes() == found for path, found in before.items())
-
-
 @pytest.fixture
 def here(project, monkeypatch):
     (project.folder / "cart.toml").write_text(project.config)
@@ -74,13 +61,13 @@ def test_files_and_folders(here, files, words, parts):
     for name, content in files.items():
         path = here.folder / name
         path.unlink() if content is None else path.write_bytes(content)
-    refused(here, words, parts)
+    here.refuses(words, parts)
 
 
 @pytest.mark.parametrize(("key", "parts"), KEYS.values(), ids=KEYS)
 def test_values_of_the_design(here, key, parts):
     (here.folder / "cart.toml").write_text(here.config.replace("sweeps = 1", f"sweeps = 1\n{key}"))
-    refused(here, OUT, parts)
+    here.refuses(OUT, parts)
 
 
 @pytest.mark.parametrize(("words", "part"), WORDS.values(), ids=WORDS)
