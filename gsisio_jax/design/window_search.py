@@ -156,7 +156,7 @@ class Search:
 
     @cached_property
     def _by_gains(self) -> np.ndarray:
-        """With the gains alone: the same for all banks that are compared with them."""
+        """With the gains alone: the same for all banks that are compared once rows have been `collected`."""
         return self._typical([])
 
     def _typical(self, kept: list[int]) -> np.ndarray:
