@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import pytest
+from oracles.uncompiled import uncompiled as without_xla
 
 jax.config.update("jax_enable_x64", True)
 # Tracing makes millions of small objects that live on: looking for garbage as often as usual is a tenth of the time.
@@ -47,3 +48,10 @@ def little_memory() -> Iterator[None]:
     yield
     jax.clear_caches()
     gc.collect()
+
+
+@pytest.fixture(scope="module")
+def uncompiled() -> Iterator[None]:
+    """For modules about what the observer says, not about how it is compiled."""
+    with without_xla():
+        yield

@@ -15,6 +15,7 @@ import jax.extend.core as jex
 import numpy as np
 
 from gsisio_jax._collector import rare_collection
+from gsisio_jax.scalar.primitive import written
 from gsisio_jax.scalar.unroll import called_jaxpr
 
 _CALLS = {
@@ -31,22 +32,28 @@ def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[...,
     matrix product may be taken in any order.
     """
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*example)
+    program, structure = _flat(closed), jax.tree.structure(shape)
+    return lambda *args: jax.tree.unflatten(structure, program(*jax.tree.leaves(args)))
+
+
+def _flat(closed: Any) -> Callable[..., list[Any]]:
+    """The program of a jaxpr: its arguments to its results, arrays all."""
     program = _Program()
     inputs = [program.place() for _ in closed.jaxpr.invars]
     with np.errstate(all="ignore"):
         outputs = program.add(closed.jaxpr, closed.consts, inputs)
     program.drop_unused(outputs)
-    structure, dtypes = jax.tree.structure(shape), [v.aval.dtype for v in closed.jaxpr.outvars]
+    given, found = ([v.aval.dtype for v in group] for group in (closed.jaxpr.invars, closed.jaxpr.outvars))
 
-    def run(*args: Any) -> Any:
+    def run(*args: Any) -> list[Any]:
         values = list(program.values)
-        for place, leaf, var in zip(inputs, jax.tree.leaves(args), closed.jaxpr.invars, strict=True):
-            values[place] = np.asarray(leaf, var.aval.dtype)
+        for place, leaf, dtype in zip(inputs, args, given, strict=True):
+            values[place] = np.asarray(leaf, dtype)
         with np.errstate(all="ignore"):
             for operation, operands, places in program.operations:
                 for place, value in zip(places, operation(*(values[i] for i in operands)), strict=True):
                     values[place] = value
-        return jax.tree.unflatten(structure, [np.asarray(values[i], d) for i, d in zip(outputs, dtypes, strict=True)])
+        return [np.asarray(values[i], dtype) for i, dtype in zip(outputs, found, strict=True)]
 
     return run
 
@@ -75,7 +82,10 @@ class _Program:
 
         for eqn in jaxpr.eqns:
             operands = [of(atom) for atom in eqn.invars]
-            if eqn.primitive.name in _CALLS:
+            if (function := written(eqn)) is not None:
+                body = jax.make_jaxpr(function)(*(atom.aval for atom in eqn.invars))
+                found = self.add(body.jaxpr, body.consts, operands)
+            elif eqn.primitive.name in _CALLS:
                 found = self.add(*called_jaxpr(eqn), operands)
             else:
                 found = self._append(_operation(eqn), operands, len(eqn.outvars))
@@ -115,6 +125,8 @@ def _operation(eqn: Any) -> Callable[..., Sequence[Any]]:
     if name == "split":
         ends = np.cumsum(params["sizes"])[:-1]
         return lambda x: np.split(x, ends, axis=params["axis"])
+    if name == "scan":
+        return _scan(eqn)
 
     def bound(*args: Any) -> Sequence[Any]:
         with jax.ensure_compile_time_eval():
@@ -122,6 +134,26 @@ def _operation(eqn: Any) -> Callable[..., Sequence[Any]]:
         return [np.asarray(value) for value in (out if eqn.primitive.multiple_results else [out])]
 
     return bound
+
+
+def _scan(eqn: Any) -> Callable[..., Sequence[Any]]:
+    """Turn by turn: compiled it would be one large program."""
+    params = eqn.params
+    turn, length = _flat(params["jaxpr"]), params["length"]
+    first, kept = params["num_consts"], params["num_carry"]
+    order = range(length)[::-1] if params["reverse"] else range(length)
+
+    def run(*args: Any) -> Sequence[Any]:
+        fixed, carry, rows = args[:first], args[first : first + kept], args[first + kept :]
+        stacked = [np.zeros(v.aval.shape, v.aval.dtype) for v in eqn.outvars[kept:]]
+        for i in order:
+            found = turn(*fixed, *carry, *(row[i] for row in rows))
+            carry = found[:kept]
+            for column, value in zip(stacked, found[kept:], strict=True):
+                column[i] = value
+        return [*carry, *stacked]
+
+    return run
 
 
 def _scale(factor: Any, value: Any) -> Any:
@@ -193,6 +225,7 @@ _ARRAYS: dict[str, Callable[..., Any]] = {
     "convert_element_type": lambda params, x: x.astype(params["new_dtype"]),
     "broadcast_in_dim": _broadcast,
     "slice": _slice,
+    "bitcast_convert_type": lambda params, x: np.asarray(x).view(params["new_dtype"]),
     "iota": _iota,
     "reshape": lambda params, x: np.reshape(x, params["new_sizes"]),
     "squeeze": lambda params, x: np.squeeze(x, tuple(params["dimensions"])),

@@ -8,6 +8,7 @@ is compiled. Reverse mode keeps the arguments of a program and nothing else; the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -32,6 +33,12 @@ def run(program: ScalarProgram, args: Sequence[Any]) -> list[Any]:
     """Entries of all results from entries of all arguments, array by array."""
     args = [jnp.asarray(arg, number.dtype) for arg, number in zip(args, program.inputs, strict=True)]
     return _program.bind(*args, program=program, levels=())
+
+
+def written(eqn: Any) -> Callable[..., Any] | None:
+    """JAX operations of an equation that is a program of numbers or its derivative; None for any other."""
+    bodies = {_program: _lowered, _tangent: _tangent_function}
+    return partial(bodies[eqn.primitive], **eqn.params) if eqn.primitive in bodies else None
 
 
 def _function(program: ScalarProgram, levels: Levels) -> Callable[..., Any]:

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from inclusion.test_compositions import JUMPING, KINKED, SMOOTH, boxes, build, programs, to_box
 from inclusion_points import points
+from oracles.uncompiled import in_numpy
 
 from gsisio_jax import Interval, inclusion
 
@@ -23,7 +24,6 @@ FORMS = {
 }
 SIZES = (1, 2, 3, 4)
 # Compiling is what these tests spend their time on.
-fast_jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def function(n):
@@ -45,7 +45,7 @@ def some_boxes(n, count=60, seed=0):
 def bounds(n):
     """All forms and the Jacobian enclosure on `some_boxes`, as NumPy."""
 
-    @fast_jit
+    @in_numpy
     @jax.vmap
     def run(lower, upper):
         # The derivative is computed once for all forms; `test_default_derivative` is about the forms' own.
@@ -180,7 +180,7 @@ def test_decomposition_function_is_monotone(n, form):
     lower, upper = some_boxes(n)
     k = widest(n)
     a, b = bounds(n)["jacobian"].lower[k], bounds(n)["jacobian"].upper[k]
-    f_d = jax.jit(jax.vmap(inclusion.decomposition_function(function(n), Interval(a, b), form)))
+    f_d = in_numpy(jax.vmap(inclusion.decomposition_function(function(n), Interval(a, b), form)))
     rng = np.random.default_rng(n)
     x, y, more = lower[k] + (upper[k] - lower[k]) * rng.choice([0, 1, 0.5, *rng.uniform(0, 1, 9)], (3, 2000, n))
     more = np.maximum(x, more)
@@ -204,7 +204,7 @@ def test_bounds_from_fixed_derivatives_shrink_with_the_box():
     k = widest(n)
     jac = Interval(bounds(n)["jacobian"].lower[k], bounds(n)["jacobian"].upper[k])
 
-    @fast_jit
+    @in_numpy
     @functools.partial(jax.vmap, in_axes=(0, None))
     def run(box, derivative):
         f_d = inclusion.decomposition_function(function(n), derivative, "optimal")
@@ -227,7 +227,7 @@ def test_bounds_from_own_derivatives_need_not_shrink_with_the_box():
         return -x[0] + 2.1 / 11 * x[0] ** 11
 
     ends = np.array([[1.0], [0.99]])
-    whole, part = fast_jit(jax.vmap(inclusion.decomposition(f)))(Interval(0 * ends, ends)).lower
+    whole, part = in_numpy(jax.vmap(inclusion.decomposition(f)))(Interval(0 * ends, ends)).lower
     assert whole == pytest.approx(-1)
     assert part < -1.7
 
@@ -239,13 +239,13 @@ def test_compositions(program, sides):
     its own such test.)"""
     f, box = build(*zip(*program, strict=True)), to_box(sides)
     x = points(box.lower, box.upper)
-    evaluate = fast_jit(jax.vmap(f))
+    evaluate = in_numpy(jax.vmap(f))
     value = np.asarray(evaluate(x))
     # At a jump rounding alone may take the other side: look where f does not move with x.
     near = [np.asarray(evaluate(x * (1 + sign * 1e-12) + sign * 1e-13)) for sign in (1, -1)]
     steady = np.all([np.abs(v - value).max(1) < 1e-6 for v in near], axis=0)
 
-    @fast_jit
+    @in_numpy
     def run(box):
         jac = inclusion.jacobian(f)(box)
         f_d = inclusion.decomposition_function(f, jac, "optimal")
@@ -265,7 +265,7 @@ def test_default_derivative():
     def f(x, u):
         return jnp.stack([u * jnp.sin(x[0]) + x[1], x[0] * x[1]])
 
-    @fast_jit
+    @in_numpy
     def run(box, u):
         jac = inclusion.jacobian(f)(box, u)
         return [(form(f)(box, u), form(f, jac)(box, u)) for form in FORMS.values()]

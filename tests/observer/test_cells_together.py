@@ -15,6 +15,8 @@ import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 from gsisio_jax.observer import cells
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 RUNS, STEPS = 64, 12
 ball = Interval.symmetric
 
@@ -41,7 +43,7 @@ def simulated(f, g, G, noise, start, size):
 
 
 def boxes(observer, start, y):
-    run = jax.jit(jax.vmap(lambda y: gx.estimate(observer, start, y)))
+    run = jax.vmap(lambda y: gx.estimate(observer, start, y))
     return jax.tree.map(np.asarray, run(jnp.asarray(y)))
 
 
@@ -101,7 +103,7 @@ def compass():
     )
     observer = gx.design_observer(system, COMPASS_NOISE, Interval.entire(1), cells=8, window=1)
     assert observer.cells == (8,)
-    return jax.jit(jax.vmap(lambda start, y: gx.estimate(observer, start, y), (None, 0)))
+    return jax.vmap(lambda start, y: gx.estimate(observer, start, y), (None, 0))
 
 
 @pytest.mark.parametrize("start", [Interval([2.5], [3.3]), Interval([-np.inf], [np.inf])])

@@ -14,6 +14,8 @@ from oracles.record_hull import exact_hull
 import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 STEPS = 24
 
 

@@ -13,6 +13,8 @@ from gsisio_jax.interval.image import image
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.input_boxes import exact_input
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 
 def plant(input_bounds=None):
     """Three states, three outputs, two inputs that enter nearly everything: a tall [G; H] without zeros."""
@@ -47,7 +49,7 @@ def test_exact_for_boxes_of_every_kind(bound):
     radius = random.exponential(0.4, (count, 6))
     radius[random.random((count, 6)) < 0.2] = np.inf
     lower, upper = center - radius, center + radius
-    boxes, conflicts = jax.jit(jax.vmap(lambda a, b: explained(observer, a, b)))(lower, upper)
+    boxes, conflicts = jax.vmap(lambda a, b: explained(observer, a, b))(lower, upper)
     limits = [(None, None), (None if bound is None else -bound, bound)]
     rows = S if bound is None else np.vstack([S, [0.0, 1.0]])
     feasible = 0

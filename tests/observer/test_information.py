@@ -8,6 +8,8 @@ import pytest
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 STEPS = 100
 
 

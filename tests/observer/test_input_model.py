@@ -13,6 +13,8 @@ from gsisio_jax import Interval
 from gsisio_jax.design import input_rows
 from gsisio_jax.observer.residuals import input_row_residual
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 A, G = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
 W, V, START = np.array([1e-3, 1e-3]), np.array([0.1, 0.1]), np.array([1.0, 1.0])
 NOISE = gx.Noise(Interval.symmetric(W), Interval.symmetric(V))
@@ -46,7 +48,7 @@ def records(moves):
 
 
 def estimates(observer, y):
-    return jax.jit(jax.vmap(partial(gx.estimate, observer, INITIAL)))(y)
+    return jax.vmap(partial(gx.estimate, observer, INITIAL))(y)
 
 
 def misses(boxes, truth):
@@ -127,7 +129,7 @@ def test_a_gross_fault_that_is_held_is_a_lost_row(rated):
     faulty, lost = y[0].copy(), y[0].copy()
     faulty[20] += 50.0
     lost[20] = np.nan
-    held = jax.jit(jax.vmap(partial(gx.estimate, observer, INITIAL, on_conflict="hold")))(np.stack([faulty, lost]))
+    held = jax.vmap(partial(gx.estimate, observer, INITIAL, on_conflict="hold"))(np.stack([faulty, lost]))
     assert np.flatnonzero(np.asarray(held.status)[0] & gx.Status.CONFLICT).tolist() == [20]
     assert not (np.asarray(held.status)[1] & gx.Status.CONFLICT).any()
     for run in (0, 1):

@@ -15,6 +15,8 @@ from benchmarks import example_hull
 from gsisio_jax import Interval
 from gsisio_jax.observer.free_rows import FreeRows
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 CASE = systems.s1(region=(1.0, 1.0))
 STEPS, RUNS = 24, 40
 G, H = np.asarray(CASE.system.G), np.asarray(CASE.system.H)
@@ -51,7 +53,7 @@ def _simulated(scale):
 @pytest.fixture(scope="module")
 def run(observer):
     """Boxes of every step, one record after the other in one program."""
-    found = jax.jit(jax.vmap(lambda y: gx.estimate(observer, CASE.initial, y)))
+    found = jax.vmap(lambda y: gx.estimate(observer, CASE.initial, y))
     return lambda y: jax.tree.map(np.asarray, found(jnp.asarray(y)))
 
 
@@ -119,7 +121,7 @@ def test_gaps_and_conflicts(small):
     y[rng.random(y.shape) < 0.1] = np.nan
     y[:, 10] = np.nan
     y[:100, wrong, 2] = 5.0  # a cosine
-    found = jax.jit(jax.vmap(lambda row: gx.estimate(small, Interval.symmetric([3.0]), row)))(y)
+    found = jax.vmap(lambda row: gx.estimate(small, Interval.symmetric([3.0]), row))(y)
     box = jax.tree.map(np.asarray, found.state)
     inside = ((box.lower[..., 0] <= true) & (true <= box.upper[..., 0])) | (np.arange(steps) == wrong)
     assert inside.all()

@@ -15,6 +15,8 @@ import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 from gsisio_jax.observer.estimation import collect, resume
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 RUNS = 4
 
 

@@ -13,6 +13,8 @@ from recovery_plants import DETERMINED, PLANTS, designed, records, steps_until_d
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 FAULT = 10
 
 

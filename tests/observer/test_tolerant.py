@@ -11,6 +11,8 @@ from scipy.optimize import linprog
 import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 
+pytestmark = pytest.mark.usefixtures("uncompiled")
+
 TURN = 0.95 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
 C = np.array([[1.0, 0], [0, 1], [1, 1]])
 G = np.array([[1.0], [0.5]])
@@ -33,7 +35,7 @@ def observers():
 
 @pytest.fixture(scope="module")
 def run(observers):
-    return jax.jit(jax.vmap(lambda initial, y: gx.estimate(observers[0], initial, y), (None, 0)))
+    return jax.vmap(lambda initial, y: gx.estimate(observers[0], initial, y), (None, 0))
 
 
 def records(seed, count, rows=ROWS):
@@ -219,7 +221,7 @@ def test_studies_take_it():
     x = rng.uniform(-2, 2, (20, 1, 1)) * 0.9 ** np.arange(ROWS)[:, None]
     y = x + rng.uniform(-0.1, 0.1, (20, ROWS, 2))
     y[:, ::2, 0] += 30
-    est = jax.jit(jax.vmap(lambda y: gx.estimate(observer, initial, y)))(y)
+    est = jax.vmap(lambda y: gx.estimate(observer, initial, y))(y)
     found = gx.study.sweep(
         observer, initial, gx.grid("run", y), truth=gx.grid("run", (x, None)), reduce=("max", "coverage")
     )
