@@ -141,8 +141,10 @@ def design_current(
         way = what_settles(plan, on, box)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))
     if not everywhere.affine:
-        found = (undefined_in(system, box, u_region), grown_around(near, box) if given is None else "")
-        observer = replace(observer, certificate=observer.certificate.with_notes(*found))
+        undefined, found = undefined_in(system, box, u_region), observer.certificate
+        found = found.without_promise(undefined) if undefined else found
+        found = found.with_notes(grown_around(near, box) if given is None else "")
+        observer = replace(observer, certificate=found)
     window = 1 if dials.tolerate else dials.window
     if window == "auto" and not (first.slopes.finite and not system.periodic_states):
         window = 1
