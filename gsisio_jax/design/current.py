@@ -34,7 +34,7 @@ from gsisio_jax.design.input_rows import rows_of_inputs
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.progress import Say
 from gsisio_jax.design.recovery import with_recovery
-from gsisio_jax.design.region import find_region, grown_around
+from gsisio_jax.design.region import Near, find_region, grown_around
 from gsisio_jax.design.slices import what_split_gives, with_slices
 from gsisio_jax.design.tolerant import Guessed, tolerant
 from gsisio_jax.design.undefined import undefined_in
@@ -71,7 +71,7 @@ def design_current(
     system: System,
     noise: Noise,
     given: Interval | None,
-    near: Interval | None,
+    near: Near | None,
     u_region: Interval,
     dials: Dials,
     say: Say,
@@ -87,7 +87,7 @@ def design_current(
     except ObserverDoesNotExist as error:
         say("looking for what would help")
         reason = with_delay(error, system, u_region)
-        ways = what_helps(plan, on, near if given is None else given)
+        ways = what_helps(plan, on, _place(near) if given is None else given)
         raise type(reason)(f"{reason}{ways}") from None
     say("looking for a region")
     box = _found_region(plan, on, dials.certify, near) if given is None else given
@@ -182,17 +182,21 @@ def design_current(
     return replace(observer, certificate=certificate)
 
 
-def _found_region(plan: Plan, on: Enclosures, certify: bool, near: Interval | None) -> Interval:
+def _found_region(plan: Plan, on: Enclosures, certify: bool, near: Near | None) -> Interval:
     """region="auto"; where there is none and no certificate is asked for, the point that the search began at."""
     try:
         return find_region(plan.system, lambda box: _steady_width(plan, box, on.slopes(box)), near)
     except NoDesignFound as error:
         if certify:
-            raise NoDesignFound(f"{error}{what_helps(plan, on, near)}") from None
+            raise NoDesignFound(f"{error}{what_helps(plan, on, _place(near))}") from None
         if near is not None:
-            return near
+            return near.box
         center = np.asarray(plan.system.state_bounds.center, np.float64)
         return Interval(center, center)
+
+
+def _place(near: Near | None) -> Interval | None:
+    return None if near is None else near.box
 
 
 def _steady_width(plan: Plan, region: Interval, slopes: Slopes) -> np.ndarray:
