@@ -74,7 +74,8 @@ def test_mistakes(options, message):
 def test_where_there_is_no_such_region_the_place_is_named():
     loud = gx.Noise(Interval.symmetric([3.0]), Interval.symmetric([3.0]))
     steep = gx.System(lambda x: x, lambda x: x + 1.1 * jnp.sin(x), G=[[1.0]], H=[[0.0]])
-    with pytest.raises(gx.NoDesignFound, match=r"around \[2.0\] to \[3.0\] that holds its own steady width.*smaller or another box"):
+    message = r"around \[2.0\] to \[3.0\] that holds its own steady width.*smaller or another box"
+    with pytest.raises(gx.NoDesignFound, match=message):
         gx.design_observer(steep, loud, "auto", missing=False, around=Interval([2.0], [3.0]))
 
 
