@@ -26,7 +26,7 @@ from gsisio_jax.design.gain_selection import (
     typical_width,
 )
 from gsisio_jax.design.gains import optimal_gain
-from gsisio_jax.design.gains_with_less import gains_with_less
+from gsisio_jax.design.gains_with_less import certified_with_less, gains_with_less
 from gsisio_jax.design.gains_without_outputs import gains_without_outputs
 from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
 from gsisio_jax.design.initial_contraction import check_initial_contraction
@@ -109,6 +109,17 @@ def design_current(
         )  # fmt: skip
 
     width = profile_of(problem, problem.steady_width(main), box)
+    if dials.split != 1 and not (first.uncertified or everywhere.affine):
+        inputs = input_bounds(problem, width)
+
+        def promised(gain: np.ndarray) -> np.ndarray:
+            alone = assemble(plan, problem, box, [gain], inputs, False, dials.methods, dials.sweeps)
+            weights = np.asarray(alone.gains.residual[0])
+            found = with_slices(alone.certificate, noise, weights, on.slopes, box, dials.split)
+            return np.asarray(found.steady_width)
+
+        main = certified_with_less(problem, main, box, promised)
+        width = profile_of(problem, problem.steady_width(main), box)
     if dials.gains == "auto":
         bank = grown(
             [main],
@@ -120,6 +131,8 @@ def design_current(
     together = [j for j, _ in system.periodic] if dials.missing or system.periodic else None
     if together is not None:  # the multiple of a periodic output is chosen without that output
         bank.extend(gains_for_missing(problem, main, box, together))
+    if main is not first.gain:
+        bank.append(first.gain)
     guessed = Guessed(problem, main, box, feedthrough, dials.tolerate) if dials.tolerate else None
     if guessed is not None:
         bank.extend(guessed.gains())
