@@ -22,10 +22,12 @@ Around = Interval | Any
 
 @dataclass(frozen=True)
 class Near:
-    """What a region is looked for around: the hull of what was given, and whether that was a whole trajectory."""
+    """What a region is looked for around: the hull of what was given, whether that was a whole trajectory, and whether
+    boxes or states."""
 
     box: Interval
     along: bool
+    boxes: bool
 
 
 def find_region(system: System, steady_width: Callable[[Interval], np.ndarray], around: Near | None) -> Interval:
@@ -104,14 +106,19 @@ def read_around(system: System, around: Around, auto: bool) -> Near | None:
             f"to {bounds.upper[i]:g}"
         )
     hull = Interval(np.where(known, lower, np.inf).min(0), np.where(known, upper, -np.inf).max(0))
-    return Near(hull, along=len(shape) == 2)
+    return Near(hull, along=len(shape) == 2, boxes=box)
 
 
 def grown_around(around: Near | None, region: Interval) -> str:
     """What a reader of the certificate should know of a region that was found without being told of the whole run; ""
-    where that was a trajectory."""
-    if around is not None and around.along:
+    where all boxes of one were given."""
+    if around is not None and around.along and around.boxes:
         return ""
+    if around is not None and around.along:
+        return (
+            "the region has room for settled boxes along the states that were given; wider ones, as the first of a run, "
+            "leave it: give the boxes of an earlier estimate as `around`, and look at est.summary()"
+        )
     if around is not None:
         return (
             "the region was grown around one state or box; a run that goes on elsewhere leaves it: give the trajectory "

@@ -35,7 +35,11 @@ def test_the_region_has_room_around_what_was_given(around, lower, upper):
     assert promise.region.upper[0] >= min(upper + room, 8.0)
     assert promise.region.upper[0] <= 8.0
     (said,) = promise.notes or ("",)
-    assert said == "" if np.ndim(around.lower if isinstance(around, Interval) else around) == 2 else "one state" in said
+    boxes = isinstance(around, Interval)
+    if np.ndim(around.lower if boxes else around) == 1:
+        assert "around one state or box" in said
+    else:
+        assert said == "" if boxes else "along the states that were given" in said
 
 
 def test_boxes_of_the_run_stay_in_the_region_that_was_grown_around_it():
