@@ -116,8 +116,8 @@ def grown_around(around: Near | None, region: Interval) -> str:
         return ""
     if around is not None and around.along:
         return (
-            "the region has room for settled boxes along the states that were given; wider ones, as the first of a run, "
-            "leave it: give the boxes of an earlier estimate as `around`, and look at est.summary()"
+            "the region has room for settled boxes along the states that were given; wider ones, as the first of a "
+            "run, leave it: give the boxes of an earlier estimate as `around`, and look at est.summary()"
         )
     if around is not None:
         return (

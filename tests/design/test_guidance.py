@@ -52,10 +52,49 @@ def test_suggestions_of_a_plant_without_an_observer_work_and_the_others_do_not()
             design(system)
 
 
-def test_where_one_thing_more_is_not_enough_that_is_said():
-    blind = gx.System(lambda x: 0.5 * x, lambda x: x[:1], G=np.eye(3), H=np.zeros((1, 3)))
-    with pytest.raises(gx.ObserverDoesNotExist, match="neither one more state measured nor one more bound"):
-        design(blind)
+def test_where_one_thing_more_is_not_enough_two_are_tried():
+    """Two arms with a torque each, whose angles are measured: each torque needs something."""
+
+    def arms(more=(), **known):
+        def f(x):
+            return jnp.stack([x[0] + 0.1 * x[2], x[1] + 0.1 * x[3], x[2] - 0.1 * jnp.sin(x[0]), x[3] - 0.1 * x[1]])
+
+        rows = [0, 1, *more]
+        G = np.array([[0.0, 0], [0, 0], [0.1, 0], [0, 0.1]])
+        system = gx.System(f, lambda x: jnp.stack([x[i] for i in rows]), G=G, H=np.zeros((len(rows), 2)), **known)
+        noise = gx.Noise(ball(*[0.01] * 4), Interval.symmetric([0.1] * len(rows)))
+        return gx.design_observer(system, noise, ball(*[2.0] * 4), missing=False, window=1)
+
+    with pytest.raises(gx.ObserverDoesNotExist) as error:
+        arms()
+    _, head, *lines = str(error.value).splitlines()
+    assert "neither one more state measured nor one more bound" in head
+    assert head.endswith("two together are:")
+    inf = np.inf
+    ways = {
+        "measure states 3 and 4 as well": {"more": (2, 3)},
+        "`input_bounds` with two finite sides for inputs 1 and 2": {"input_bounds": ball(3.0, 3.0)},
+        "`state_bounds` with two finite sides for states 3 and 4": {"state_bounds": ball(inf, inf, 2.0, 2.0)},
+        "measure state 3 as well, and `input_bounds` with two finite sides for input 2": {
+            "more": (2,), "input_bounds": ball(inf, 3.0),
+        },
+        "measure state 3 as well, and `state_bounds` with two finite sides for state 4": {
+            "more": (2,), "state_bounds": ball(inf, inf, inf, 2.0),
+        },
+    }  # fmt: skip
+    for way, known in ways.items():
+        assert f"  {way}: widths settle;" in lines
+        assert arms(**known).certificate.certified
+    for known in ({"more": (2,)}, {"more": (2,), "input_bounds": ball(3.0, inf)}):
+        with pytest.raises(gx.ObserverDoesNotExist):
+            arms(**known)
+
+
+def test_where_two_things_more_are_not_enough_that_is_said():
+    blind = gx.System(lambda x: 0.5 * x, lambda x: x[:1], G=np.eye(4), H=np.zeros((1, 4)))
+    noise = gx.Noise(ball(*[0.01] * 4), ball(0.1))
+    with pytest.raises(gx.ObserverDoesNotExist, match=r"is enough by itself, nor are two of them together\.$"):
+        gx.design_observer(blind, noise, ball(*[2.0] * 4), missing=False)
 
 
 def test_a_smaller_region_is_proposed_only_where_it_works():
