@@ -187,7 +187,7 @@ def design_observer(
             all of it and the steady boxes there. None: the centre of the state bounds (0 where there are none); a run
             elsewhere leaves such a region, which the certificate notes, and ``est.summary()`` counts.
         progress: say on standard error what the design is at, once it has taken two seconds. None: where that is a
-            terminal.
+            terminal or a notebook.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
