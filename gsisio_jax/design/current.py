@@ -28,7 +28,8 @@ from gsisio_jax.design.gain_selection import (
 from gsisio_jax.design.gains import optimal_gain
 from gsisio_jax.design.gains_with_less import certified_with_less, gains_with_less
 from gsisio_jax.design.gains_without_outputs import gains_without_outputs
-from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
+from gsisio_jax.design.guidance import what_helps, what_settles
+from gsisio_jax.design.guidance_recovery import what_recovers
 from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.input_rows import rows_of_inputs
 from gsisio_jax.design.inputs import input_bounds
@@ -191,7 +192,7 @@ def design_current(
     if maps is not None:
         observer, certificate = with_anchored_rows(observer, certificate, problem, maps, width, u_region)
     if certificate.recoverable is False:
-        certificate = certificate.with_notes(what_recovers(plan, on, box))
+        certificate = certificate.with_notes(what_recovers(plan, on, box, maps))
     return replace(observer, certificate=certificate)
 
 

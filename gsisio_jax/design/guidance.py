@@ -30,7 +30,6 @@ _MOST = 12  # candidates of a kind: plants with more states are told of the firs
 _MOST_PAIRS = 66  # that are tried
 _SHOWN_PAIRS = 6
 _SINGULAR = 1e-6  # determinants below this are not divided by, as in the design
-_RANK = 1e-9
 
 
 @dataclass(frozen=True)
@@ -101,16 +100,10 @@ def _two_that_help(plan: Plan, on: Enclosures, region: Interval) -> str:
 
 def what_settles(plan: Plan, on: Enclosures, region: Interval) -> str:
     """Which further sensor or bound makes widths settle where they do not; "" where none of them alone does."""
-    return _one_of("widths would settle", plan, on, region, lambda one: _verdict(one) is True)
+    return one_of("widths would settle", plan, on, region, lambda one: _verdict(one) is True)
 
 
-def what_recovers(plan: Plan, on: Enclosures, region: Interval) -> str:
-    """Which further sensor or bound makes boxes finite again after a lost row; "" where none of them alone does."""
-    found = _one_of("after a lost row boxes would become finite again", plan, on, region, _recovers)
-    return found or "after a lost row no single further sensor or bound makes boxes finite again (tried)"
-
-
-def _one_of(
+def one_of(
     what: str,
     plan: Plan,
     on: Enclosures,
@@ -258,12 +251,12 @@ def _starts(one: Changed, problem: GainProblem, gain: np.ndarray) -> bool:
     R = (np.abs(one.everywhere.Z - C) + one.everywhere.Z_radius)[used]
     if np.isfinite(R).all() and spectral_radius(np.abs(N_z[:, used]) @ R) < 1:
         return True
-    slope, finite = _first_form(one)
+    slope, finite = first_form(one)
     matrix = np.eye(problem.n) + N_z[:, used] @ (slope - C)[used]
     return bool(finite[used].all()) and abs(np.linalg.det(matrix)) > _SINGULAR
 
 
-def _first_form(one: Changed) -> tuple[np.ndarray, np.ndarray]:
+def first_form(one: Changed) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (q, n) of the affine bounds of T2 g on the state bounds, and which of them have a finite remainder."""
     if one.everywhere.near_affine(one.everywhere.Z_radius):
         return one.everywhere.Z, np.full(len(one.everywhere.Z), True)
@@ -272,35 +265,3 @@ def _first_form(one: Changed) -> tuple[np.ndarray, np.ndarray]:
     finite = np.isfinite(form.offset.lower) & np.isfinite(form.offset.upper)
     measured = np.eye(slope.shape[1])[one.sensors]
     return np.vstack([slope, measured]), np.append(finite, np.full(len(measured), True))
-
-
-def _recovers(one: Changed) -> bool:
-    """Do the measurements determine the state when nothing is known of the past: at once, or (where f and g are affine)
-    within n + 4 steps, whatever the unknown input does?"""
-    system = one.plan.system
-    bounded = np.eye(system.n)[np.isfinite(np.asarray(system.state_bounds.width))]
-    slope, finite = _first_form(one)
-    if _rank(np.vstack([slope[finite], bounded])) == system.n:
-        return True
-    if not one.everywhere.affine:
-        return False
-    free = ~np.isfinite(np.asarray(system.input_bounds.width))
-    G, H = np.asarray(system.G)[:, free], np.asarray(system.H)[:, free]
-    steps = system.n + 4
-    state = np.hstack([np.eye(system.n), np.zeros((system.n, steps * G.shape[1]))])
-    seen: list[np.ndarray] = []
-    for k in range(steps):
-        now = np.zeros((G.shape[1], state.shape[1]))
-        now[:, system.n + k * G.shape[1] : system.n + (k + 1) * G.shape[1]] = np.eye(G.shape[1])
-        seen += [one.everywhere.E @ state + H @ now, bounded @ state]
-        outputs = np.vstack(seen)
-        if _rank(outputs) == _rank(np.vstack([outputs, state])):
-            return True
-        state = one.everywhere.F @ state + G @ now
-    return False
-
-
-def _rank(matrix: np.ndarray) -> int:
-    norms = np.linalg.norm(matrix, axis=1, keepdims=True)
-    singular = np.linalg.svd(matrix / np.where(norms > 0, norms, 1.0), compute_uv=False)
-    return int((singular > _RANK * singular.max(initial=0.0)).sum()) if len(singular) else 0

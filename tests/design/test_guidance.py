@@ -1,5 +1,7 @@
 """What would help is computed: every suggestion works when it is followed, and what is not suggested does not."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -126,6 +128,52 @@ def test_what_would_make_widths_settle_is_noted():
         "widths would settle with one of these (tried): measure state 2 as well; or `state_bounds` with two finite "
         "sides for state 2",
     )
+
+
+A_FOUR = np.array([[0.7, 0.1, 0, 0], [0, 0.6, 0.1, 0], [0, 0, 0.8, 0.1], [0.1, 0, 0, 0.5]])
+GAPS = {
+    # A bounded nonlinearity, one output of two states that the input moves.
+    "tanh chain": (
+        lambda x: jnp.stack([0.8 * x[0] + 0.1 * jnp.tanh(x[1]), 0.6 * x[1] + 0.1 * x[0], 0.5 * x[2] + 0.2 * x[1]]),
+        lambda x: [x[0] + 0.3 * x[2]], [[1.0], [0.0], [0.5]], [[0.0]], 3,
+    ),
+    # Two inputs, one of them in an output: the bounds of some states say where others are, but not to boxes.
+    "four states": (
+        lambda x: A_FOUR @ x, lambda x: [x[0] + x[3], x[1]], [[1.0, 0], [0, 0], [0, 0], [0.5, 0]],
+        [[0.0, 0], [0, 1.0]], 4,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GAPS)
+def test_what_is_said_to_bring_boxes_back_does_and_nothing_else(name):
+    """Every sensor and bound by itself, against the recovery of a design with it."""
+    f, g, G, H, n = GAPS[name]
+    p = len(G[0])
+
+    def promise(more=(), **known):
+        rows = np.vstack([H, np.zeros((len(more), p))])
+        system = gx.System(f, lambda x: jnp.stack([*g(x), *(x[i] for i in more)]), G=G, H=rows, **known)
+        noise = gx.Noise(ball(*[0.01] * n), ball(*[0.1] * len(rows)))
+        region = ball(*[2.0] * n)
+        return gx.design_observer(system, noise, region, window=1, cells=1, sweeps=1, certify=False).certificate
+
+    def only(size, i, radius):
+        return ball(*np.where(np.arange(size) == i, radius, np.inf))
+
+    found = promise()
+    assert found.recoverable is False
+    bound = "`{}_bounds` with two finite sides for {} "
+    changes = [("measure state {} as well", i, {"more": (i,)}) for i in range(n)]
+    changes += [(bound.format("input", "input") + "{}", j, {"input_bounds": only(p, j, 3.0)}) for j in range(p)]
+    changes += [(bound.format("state", "state") + "{}", i, {"state_bounds": only(n, i, 2.0)}) for i in range(n)]
+    said = {}
+    for way in found.notes[-1].partition("(tried): ")[2].split("; or "):
+        kind, numbers = re.match(r"(.*(?:state|input) )([\d, or]+)", way).groups()
+        said[kind] = set(re.findall(r"\d+", numbers))
+    for text, index, known in changes:
+        expected = str(index + 1) in said.get(text.partition("{")[0], ())
+        assert promise(**known).recoverable is expected, (text, index)
 
 
 def test_what_would_bring_boxes_back_after_a_lost_row_is_noted():
