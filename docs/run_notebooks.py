@@ -26,7 +26,14 @@ def run(path: Path) -> None:
         cell.metadata.pop("execution", None)
         for output in cell.get("outputs", []):
             _without_temporary_names(output)
+        if "outputs" in cell:
+            cell.outputs = [output for output in cell.outputs if not _wiped_out(output)]
     nbformat.write(notebook, path)
+
+
+def _wiped_out(output: Any) -> bool:
+    """Progress of a design: nothing of it is left on a page, but in the file it would differ with every run."""
+    return output.get("name") == "stderr" and output.get("text", "").startswith("\r")
 
 
 def _without_temporary_names(part: Any) -> None:

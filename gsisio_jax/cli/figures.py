@@ -24,7 +24,8 @@ def run_figures(
     Returns:
         ``title``, ``library``, ``steps``, ``time`` (first and last, seconds), ``missing`` (rows without any and with
         some entries missing), ``statuses`` (steps by bit), ``outside`` (``steps`` without a promised width, because the
-        box of this or the last one is outside of the region at ``boxes`` of them, or u of `u_region` at ``inputs``),
+        box of this or the last one is outside of the region at ``boxes`` of them, or u of `u_region` at ``inputs``, or
+        measurements of this or the last one are missing or contradicted, at ``measurements``),
         ``doubt`` (text where nearly every step contradicts the bounds, else null), ``resumed`` (steps taken from an
         interrupted run), ``delay`` (L: boxes are from measurements up to L steps later), ``seconds``, ``table`` (what
         was found in the file and is not plain), ``signals``, ``alarms`` (as in the NetCDF file, the first 10,000),
@@ -51,7 +52,12 @@ def run_figures(
         "time": {"first": totals.first, "last": totals.last},
         "missing": {"rows": totals.absent, "partly": totals.partly},
         "statuses": totals.statuses,
-        "outside": {"steps": found.outside, "boxes": found.boxes, "inputs": found.inputs},
+        "outside": {
+            "steps": found.outside,
+            "boxes": found.boxes,
+            "inputs": found.inputs,
+            "measurements": found.unread,
+        },
         "doubt": doubt(totals) or None,
         "resumed": outcome.resumed,
         "delay": outcome.boxes.delay,

@@ -84,8 +84,8 @@ def doubt(totals: Totals) -> str:
 
 
 def outside(totals: Totals, outcome: Outcome) -> Outside:
-    """Steps for which no width is promised, because of where they are."""
-    return Outside(totals.steps, totals.statuses["OUTSIDE_REGION"], totals.beyond, outcome.u_outside)
+    """Steps for which no width is promised, and why."""
+    return Outside(totals.steps, totals.outside, totals.beyond, outcome.u_outside, totals.unread)
 
 
 def certificate_lines(certificate: Any, problem: Problem, found: Outside | None = None) -> list[str]:

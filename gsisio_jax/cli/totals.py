@@ -12,7 +12,7 @@ import numpy as np
 from ..dataset import alarm_records
 from ..observer.alarms import read_alarms
 from ..observer.status import Status
-from ..observer.summary import beyond
+from ..observer.summary import beyond, unread
 from .problem import Names, Problem
 
 MOST_ALARMS = 10_000  # with their words; status and margin of the files have all
@@ -56,6 +56,8 @@ class Totals:
         absent, partly: rows without any measurement, and with some entries missing.
         statuses: steps by the bit of their status.
         beyond: steps whose state box is not inside the region.
+        unread: steps of which an output, or one of the step before, is missing, ambiguous or contradicted.
+        outside: these, and those with the status OUTSIDE_REGION.
         alarms: the first `MOST_ALARMS` as plain data; `alarm_times` has the times of all, `alarm_count` of them.
     """
 
@@ -67,6 +69,8 @@ class Totals:
     partly: int = 0
     statuses: dict[str, int] = field(default_factory=dict)
     beyond: int = 0
+    unread: int = 0
+    outside: int = 0
     alarms: list[dict[str, Any]] = field(default_factory=list)
     alarm_times: np.ndarray = field(default_factory=lambda: np.empty(0))
 
@@ -87,7 +91,7 @@ def gather(parts: Iterable[np.ndarray], problem: Problem, observer: Any) -> Tota
     totals = Totals([*_signals(problem.state, "state"), *_signals(problem.input, "input")])
     members = [member for member in Status if member.value]
     totals.statuses = {str(member.name): 0 for member in members}
-    times = []
+    times, before = [], False
     for rows in parts:
         if totals.steps == 0:
             totals.first = float(rows["time"][0])
@@ -99,6 +103,9 @@ def gather(parts: Iterable[np.ndarray], problem: Problem, observer: Any) -> Tota
         for member in members:
             totals.statuses[str(member.name)] += int(np.count_nonzero(rows["status"] & int(member)))
         totals.beyond += int(np.count_nonzero(beyond(rows["state_lower"], rows["state_upper"], region)))
+        lacking, before = unread(rows["status"], before), unread(rows["status"][-1:])[-1]
+        totals.unread += int(lacking.sum())
+        totals.outside += int((lacking | (rows["status"] & int(Status.OUTSIDE_REGION) != 0)).sum())
         width = np.concatenate([rows[f"{kind}_upper"] - rows[f"{kind}_lower"] for kind in ("state", "input")], axis=1)
         for index, signal in enumerate(totals.signals):
             signal.add(width[:, index])

@@ -28,7 +28,7 @@ def checked(
     certify: Any,
     progress: Any,
 ) -> tuple[Interval | None, Interval]:
-    """The region (None: it is to be looked for) and the box of known inputs.
+    """The region within the state bounds (None: it is to be looked for) and the box of known inputs.
 
     Raises:
         ValueError: an argument is no value that it can have; shapes do not agree.
@@ -87,6 +87,8 @@ def checked(
                 f"{i + 1} it has [{region.lower[i]:g}, {region.upper[i]:g}] and they have "
                 f"[{bounds.lower[i]:g}, {bounds.upper[i]:g}]"
             )
+        # No box leaves the state bounds, so the region that boxes can be in, and its width, end there.
+        region = Interval(np.maximum(region.lower, bounds.lower), np.minimum(region.upper, bounds.upper))
     if u_region is None:
         if system.takes_u:
             raise ValueError(

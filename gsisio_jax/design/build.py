@@ -134,8 +134,9 @@ def design_observer(
         system: the plant.
         noise: constant bounds of w and v.
         region: convex box (n,) of states for which the gain is optimised and on which the width promise holds. It does
-            not limit the observer: boxes are certain anywhere. Infinite sides are legal where f and g are affine or
-            have bounded slopes. "auto" looks for a region that has room for its own steady width, see `around`.
+            not limit the observer: boxes are certain anywhere. What lies beyond the state bounds is left out of it.
+            Infinite sides are legal where f and g are affine or have bounded slopes. "auto" looks for a region that has
+            room for its own steady width, see `around`.
         form: "current" uses y[k] for the box of x[k]; "prediction" is the paper's recursion, from y[0..k-1] alone, and
             takes none of `gains`, `missing` and `sweeps`.
         gains: size of the bank: the certified gain, and ``gains - 1`` more that are best for boxes of other widths,
@@ -156,7 +157,7 @@ def design_observer(
             "decomposition" and "remainder" as the paper uses them; None encloses it on every box, which is tighter.
         certify: current form: refuse where no width can be promised. False gives an observer without a certificate
             wherever boxes can be computed: they are certain all the same, but may be wide or infinite. Where f or g
-            jump there is never a certificate, and this makes no difference.
+            jump, or give no number in part of the region, there is never one, and this makes no difference.
         window: N: the current form also bounds x[k] from y[k-N..k] and the boxes of N steps before jointly, with rows
             chosen offline from simulated runs. 1 looks back one step; 3 to 5 come close to the exact hull where one
             step does not (rotations, chains, networks), at some more operations a step. "auto" takes 3, or 5, where
@@ -172,7 +173,8 @@ def design_observer(
             box as large as the distances, where one part may leave it as wide as the state bounds; 36 bring the boxes
             of the paper's example from 5 % to .5 % above the exact hull. A step takes many times as long. 1 takes the
             boxes whole. "auto" takes 64, of x[k] alone, where an unknown input moves such a state freely, its box would
-            stay wider than a tenth of its bounds, and cells halve it, in runs without noise; the certificate notes it.
+            stay wider than a tenth of its bounds or than twice what straight outputs would leave, and cells halve it,
+            in runs without noise; the certificate notes it.
         split: cut every state of the region into so many slices, most where slopes of f and g vary, and count slopes
             slice by slice: boxes nearly as wide as the region then get the width promise that they keep anyway, where
             the largest slope of the region says more, or leaves the certificate empty. Costs operations in proportion.
@@ -185,7 +187,7 @@ def design_observer(
             all of it and the steady boxes there. None: the centre of the state bounds (0 where there are none); a run
             elsewhere leaves such a region, which the certificate notes, and ``est.summary()`` counts.
         progress: say on standard error what the design is at, once it has taken two seconds. None: where that is a
-            terminal.
+            terminal or a notebook.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it

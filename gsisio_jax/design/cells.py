@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import jax
 import numpy as np
+from scipy.optimize import linprog
 
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.recovery import Trial
@@ -15,6 +17,7 @@ from gsisio_jax.observer.types import Observer
 
 _TRIED = 64
 _WIDE = 0.1  # share of the state bounds: a box that stays as wide is not found by what a step does otherwise
+_LOOSE = 2.0  # times the width that y[k] alone leaves where outputs are as straight as at one point: so neither
 _WORTH = 0.5  # share of the width that cells must leave, as they cost some hundred bounds of the outputs a step
 _SETTLED = 5  # last steps of a run that are looked at
 
@@ -28,8 +31,8 @@ def with_cells(
         observer: a finished one without cells.
         problem: of the design.
         cells: about how many, of the box of x[k] and of the last one; "auto" takes 64 of the first where boxes of
-            states that outputs are bent in would else become nearly as wide as their bounds, in a noise-free run from
-            a narrow box, and cells halve them.
+            states that outputs are bent in would else stay wide, in a noise-free run from a narrow box, and cells halve
+            them. Wide is a tenth of their bounds, or twice what straight outputs would leave.
         everywhere: bounds of the maps of the plant.
         u_region: of the design.
     """
@@ -42,7 +45,10 @@ def with_cells(
     if not found_anew.any():
         return observer
     whole = _widths(observer, u_region)
-    if whole is None or not (whole > _WIDE * bounds)[found_anew].any():
+    if whole is None:
+        return observer
+    wide = np.minimum(_WIDE * bounds, _LOOSE * _straight(observer, u_region))
+    if not (whole > wide)[found_anew].any():
         return observer
     cut = replace(observer, cells=counts(_TRIED, bent))
     parts = _widths(cut, u_region)
@@ -62,6 +68,22 @@ def _moved_freely(problem: GainProblem) -> np.ndarray:
     G, H = problem.G[:, problem.free], problem.H[:, problem.free]
     left = G - G @ np.linalg.pinv(H) @ H if H.size else G
     return (np.abs(left) > 1e-9 * np.abs(problem.G).max(initial=0.0)).any(1)
+
+
+def _straight(observer: Observer, u_region: Interval) -> np.ndarray:
+    """Widths (n,) of the set of states that agree with the free outputs of one step at the centre of the region, if
+    these were as straight as they are there; ``inf`` along a state that they do not bound."""
+    system, T2 = observer.system, np.asarray(observer.T2)
+    with jax.enable_x64(True):
+        x, u = (np.nan_to_num(np.asarray(b.center, np.float64)) for b in (observer.certificate.region, u_region))
+        slope = T2 @ np.asarray(jax.jacfwd(system.measurement)(x, u))
+    room = np.abs(T2) @ np.asarray(observer.noise.v.width) / 2
+    rows, room = np.vstack([slope, -slope]), np.concatenate([room, room])
+    widths = np.full(system.n, np.inf)
+    for i in range(system.n if np.isfinite(slope).all() else 0):
+        found = linprog(-np.eye(system.n)[i], A_ub=rows, b_ub=room, bounds=(None, None), method="highs")
+        widths[i] = 2 * float(found.x[i]) if found.status == 0 else np.inf
+    return widths
 
 
 def _widths(observer: Observer, u_region: Interval) -> np.ndarray | None:

@@ -26,15 +26,16 @@ from gsisio_jax.design.gain_selection import (
     typical_width,
 )
 from gsisio_jax.design.gains import optimal_gain
-from gsisio_jax.design.gains_with_less import gains_with_less
+from gsisio_jax.design.gains_with_less import certified_with_less, gains_with_less
 from gsisio_jax.design.gains_without_outputs import gains_without_outputs
-from gsisio_jax.design.guidance import what_helps, what_recovers, what_settles
+from gsisio_jax.design.guidance import what_helps, what_settles
+from gsisio_jax.design.guidance_recovery import what_recovers
 from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.input_rows import rows_of_inputs
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.progress import Say
 from gsisio_jax.design.recovery import with_recovery
-from gsisio_jax.design.region import find_region, grown_around
+from gsisio_jax.design.region import Near, find_region, grown_around
 from gsisio_jax.design.slices import what_split_gives, with_slices
 from gsisio_jax.design.tolerant import Guessed, tolerant
 from gsisio_jax.design.undefined import undefined_in
@@ -71,7 +72,7 @@ def design_current(
     system: System,
     noise: Noise,
     given: Interval | None,
-    near: Interval | None,
+    near: Near | None,
     u_region: Interval,
     dials: Dials,
     say: Say,
@@ -87,7 +88,7 @@ def design_current(
     except ObserverDoesNotExist as error:
         say("looking for what would help")
         reason = with_delay(error, system, u_region)
-        ways = what_helps(plan, on, near if given is None else given)
+        ways = what_helps(plan, on, _place(near) if given is None else given)
         raise type(reason)(f"{reason}{ways}") from None
     say("looking for a region")
     box = _found_region(plan, on, dials.certify, near) if given is None else given
@@ -109,6 +110,17 @@ def design_current(
         )  # fmt: skip
 
     width = profile_of(problem, problem.steady_width(main), box)
+    if dials.split != 1 and not (first.uncertified or everywhere.affine):
+        inputs = input_bounds(problem, width)
+
+        def promised(gain: np.ndarray) -> np.ndarray:
+            alone = assemble(plan, problem, box, [gain], inputs, False, dials.methods, dials.sweeps)
+            weights = np.asarray(alone.gains.residual[0])
+            found = with_slices(alone.certificate, noise, weights, on.slopes, box, dials.split)
+            return np.asarray(found.steady_width)
+
+        main = certified_with_less(problem, main, box, promised)
+        width = profile_of(problem, problem.steady_width(main), box)
     if dials.gains == "auto":
         bank = grown(
             [main],
@@ -120,6 +132,8 @@ def design_current(
     together = [j for j, _ in system.periodic] if dials.missing or system.periodic else None
     if together is not None:  # the multiple of a periodic output is chosen without that output
         bank.extend(gains_for_missing(problem, main, box, together))
+    if main is not first.gain:
+        bank.append(first.gain)
     guessed = Guessed(problem, main, box, feedthrough, dials.tolerate) if dials.tolerate else None
     if guessed is not None:
         bank.extend(guessed.gains())
@@ -141,8 +155,10 @@ def design_current(
         way = what_settles(plan, on, box)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))
     if not everywhere.affine:
-        found = (undefined_in(system, box, u_region), grown_around(near, box) if given is None else "")
-        observer = replace(observer, certificate=observer.certificate.with_notes(*found))
+        undefined, found = undefined_in(system, box, u_region), observer.certificate
+        found = found.without_promise(undefined) if undefined else found
+        found = found.with_notes(grown_around(near, box) if given is None else "")
+        observer = replace(observer, certificate=found)
     window = 1 if dials.tolerate else dials.window
     if window == "auto" and not (first.slopes.finite and not system.periodic_states):
         window = 1
@@ -176,21 +192,25 @@ def design_current(
     if maps is not None:
         observer, certificate = with_anchored_rows(observer, certificate, problem, maps, width, u_region)
     if certificate.recoverable is False:
-        certificate = certificate.with_notes(what_recovers(plan, on, box))
+        certificate = certificate.with_notes(what_recovers(plan, on, box, maps))
     return replace(observer, certificate=certificate)
 
 
-def _found_region(plan: Plan, on: Enclosures, certify: bool, near: Interval | None) -> Interval:
+def _found_region(plan: Plan, on: Enclosures, certify: bool, near: Near | None) -> Interval:
     """region="auto"; where there is none and no certificate is asked for, the point that the search began at."""
     try:
         return find_region(plan.system, lambda box: _steady_width(plan, box, on.slopes(box)), near)
     except NoDesignFound as error:
         if certify:
-            raise NoDesignFound(f"{error}{what_helps(plan, on, near)}") from None
+            raise NoDesignFound(f"{error}{what_helps(plan, on, _place(near))}") from None
         if near is not None:
-            return near
+            return near.box
         center = np.asarray(plan.system.state_bounds.center, np.float64)
         return Interval(center, center)
+
+
+def _place(near: Near | None) -> Interval | None:
+    return None if near is None else near.box
 
 
 def _steady_width(plan: Plan, region: Interval, slopes: Slopes) -> np.ndarray:

@@ -7,7 +7,8 @@ are kept beside those of the certified one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -46,6 +47,37 @@ def gains_with_less(problem: GainProblem, bank: list[np.ndarray], region: Interv
             if not any(_same(gain[i], row) for row in known) and _helps(problem, gain, main, i, width):
                 rows[i].append(gain[i])
     return with_rows(main, rows)
+
+
+def certified_with_less(
+    problem: GainProblem, main: np.ndarray, region: Interval, promised: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """The gain with the narrowest promise, of the certified one and those of the designs with less.
+
+    The certified one is best for slopes of the whole region. Counted slice by slice it may lean on a bound where the
+    others follow the state: a bound more would then widen the promise, and the boxes that are held to it.
+
+    Args:
+        problem: of the design.
+        main: the certified gain.
+        region: of the design.
+        promised: steady widths (n,) with a gain, as the certificate will have them.
+    """
+    others = []
+    for less, usable in _cases(problem):
+        with contextlib.suppress(NoDesignFound):
+            others.append(main_gain(less, region, usable))
+    if not others:
+        return main
+    best, width = main, promised(main)
+    for other in others:
+        reached = promised(other)
+        # Rows of (*) are apart from each other, so the better row of every state may be taken (theory 4.2).
+        mixed = np.where((reached < width)[:, None], other, best)
+        for gain, now in ((other, reached), (mixed, promised(mixed))):
+            if (now <= width).all() and (now < width * (1 - _BETTER)).any():
+                best, width = gain, now
+    return best
 
 
 def _cases(problem: GainProblem) -> Iterator[tuple[GainProblem, np.ndarray]]:

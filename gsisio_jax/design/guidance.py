@@ -1,4 +1,4 @@
-"""What would help where a design fails: one more sensor or one more bound at a time, each tried on the changed plant.
+"""What would help where a design fails: one more sensor or bound, or two of them, each tried on the changed plant.
 
 Slopes of the changed plant are those of the plant: a sensor adds a row of the identity, a bound of an input changes
 none, and with a bound of a state they are enclosed anew. So the tests that the design begins with (existence, rank, a
@@ -8,8 +8,9 @@ gain, a first box) cost a small linear program for each of them.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,28 +27,31 @@ from gsisio_jax.observer.enclosures import Enclosures, Slopes
 from gsisio_jax.plant.system import Noise
 
 _MOST = 12  # candidates of a kind: plants with more states are told of the first ones
+_MOST_PAIRS = 66  # that are tried
+_SHOWN_PAIRS = 6
 _SINGULAR = 1e-6  # determinants below this are not divided by, as in the design
-_RANK = 1e-9
 
 
 @dataclass(frozen=True)
 class Changed:
-    """A plant with one thing more known, as far as gain problems read it.
+    """A plant with some things more known, as far as gain problems read it.
 
     Attributes:
-        kind: "sensor", "input_bounds" or "state_bounds"; "nothing" for the plant as it is.
-        index: of the state or the input.
         plan: of the changed plant.
         region, everywhere: enclosures of its slopes on the region and on the state bounds.
         outputs: affine bounds of T2 g of the plant as it is, on a box (`Enclosures`).
+        changes: what is more known: "sensor", "input_bounds" or "state_bounds", and the state or the input.
     """
 
-    kind: str
-    index: int
     plan: Plan
     region: Slopes
     everywhere: Slopes
     outputs: Callable[[Interval], Any]
+    changes: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def sensors(self) -> list[int]:
+        return [index for kind, index in self.changes if kind == "sensor"]
 
 
 def what_helps(plan: Plan, on: Enclosures, region: Interval | None) -> str:
@@ -65,28 +69,41 @@ def what_helps(plan: Plan, on: Enclosures, region: Interval | None) -> str:
     for one in _changes(plan, on, region):
         verdict = _verdict(one)
         if verdict is not None:
-            found.setdefault((one.kind, verdict), []).append(one.index)
+            ((kind, index),) = one.changes
+            found.setdefault((kind, verdict), []).append(index)
     if not found:
-        return "\nTried: neither one more state measured nor one more bound of a state or an input is enough by itself."
+        alone = "neither one more state measured nor one more bound of a state or an input is enough by itself"
+        return f"\nTried: {alone}{_two_that_help(plan, on, region)}."
     lines = [
-        f"  {_words(kind, members)}: {'widths settle' if settles else 'finite boxes, but no width settles'}"
+        f"  {_words(kind, members)}: {_promise(settles)}"
         for (kind, settles), members in sorted(found.items(), key=lambda item: not item[0][1])
     ]
     return "\nTried one by one (no two of them together), each of these is enough:\n" + ";\n".join(lines) + "."
 
 
+def _two_that_help(plan: Plan, on: Enclosures, region: Interval) -> str:
+    """Which two things together make a design possible, those of one kind first."""
+    nothing = _as_it_is(plan, on, region)
+    pairs = sorted(combinations(_candidates(nothing), 2), key=lambda pair: pair[0][0] != pair[1][0])
+    found = []
+    for pair in pairs[:_MOST_PAIRS]:
+        verdict = _verdict(_with(_with(nothing, pair[0], on, region), pair[1], on, region))
+        if verdict is not None:
+            found.append((not verdict, _together(*pair)))
+    if not found:
+        return ", nor are two of them together"
+    found.sort(key=lambda way: way[0])
+    lines = [f"  {text}: {_promise(not less)}" for less, text in found[:_SHOWN_PAIRS]]
+    more = f";\n  and {len(found) - _SHOWN_PAIRS} more pairs" if len(found) > _SHOWN_PAIRS else ""
+    return "; two together are:\n" + ";\n".join(lines) + more
+
+
 def what_settles(plan: Plan, on: Enclosures, region: Interval) -> str:
     """Which further sensor or bound makes widths settle where they do not; "" where none of them alone does."""
-    return _one_of("widths would settle", plan, on, region, lambda one: _verdict(one) is True)
+    return one_of("widths would settle", plan, on, region, lambda one: _verdict(one) is True)
 
 
-def what_recovers(plan: Plan, on: Enclosures, region: Interval) -> str:
-    """Which further sensor or bound makes boxes finite again after a lost row; "" where none of them alone does."""
-    found = _one_of("after a lost row boxes would become finite again", plan, on, region, _recovers)
-    return found or "after a lost row no single further sensor or bound makes boxes finite again (tried)"
-
-
-def _one_of(
+def one_of(
     what: str,
     plan: Plan,
     on: Enclosures,
@@ -96,9 +113,23 @@ def _one_of(
     found: dict[str, list[int]] = {}
     for one in _changes(plan, on, region):
         if works(one):
-            found.setdefault(one.kind, []).append(one.index)
+            ((kind, index),) = one.changes
+            found.setdefault(kind, []).append(index)
     ways = "; or ".join(_words(kind, members) for kind, members in found.items())
     return f"{what} with one of these (tried): {ways}" if ways else ""
+
+
+def _together(first: tuple[str, int], second: tuple[str, int]) -> str:
+    (kind, i), (other, j) = first, second
+    if kind != other:
+        return f"{_words(kind, [i])}, and {_words(other, [j])}"
+    if kind == "sensor":
+        return f"measure states {i + 1} and {j + 1} as well"
+    return f"`{kind}` with two finite sides for {kind.removesuffix('_bounds')}s {i + 1} and {j + 1}"
+
+
+def _promise(settles: bool) -> str:
+    return "widths settle" if settles else "finite boxes, but no width settles"
 
 
 def _words(kind: str, members: list[int]) -> str:
@@ -112,7 +143,7 @@ def _words(kind: str, members: list[int]) -> str:
 def starts(plan: Plan, problem: GainProblem, gain: np.ndarray, here: Slopes, on: Enclosures) -> bool:
     """Would the first box of a step be finite with this gain of the plant as it is?"""
     everywhere = on.slopes(plan.system.state_bounds)
-    return _starts(Changed("nothing", 0, plan, here, everywhere, on.outputs), problem, gain)
+    return _starts(Changed(plan, here, everywhere, on.outputs), problem, gain)
 
 
 def _place(plan: Plan, region: Interval | None) -> Interval:
@@ -120,42 +151,54 @@ def _place(plan: Plan, region: Interval | None) -> Interval:
     return Interval(center, center) if region is None else region
 
 
+def _as_it_is(plan: Plan, on: Enclosures, region: Interval) -> Changed:
+    return Changed(plan, on.slopes(region), on.slopes(plan.system.state_bounds), on.outputs)
+
+
 def _changes(plan: Plan, on: Enclosures, region: Interval) -> Iterator[Changed]:
-    system = plan.system
-    bounds, known = system.state_bounds, system.input_bounds
-    here, everywhere = on.slopes(region), on.slopes(bounds)
-    if not here.finite:
-        return
-    n, p = system.n, system.p
-    unmeasured = [i for i in range(n) if not _measured(everywhere, i)]
-    for i in unmeasured[:_MOST]:
+    """The plant with each one thing more known."""
+    nothing = _as_it_is(plan, on, region)
+    if nothing.region.finite:
+        for change in _candidates(nothing):
+            yield _with(nothing, change, on, region)
+
+
+def _candidates(one: Changed) -> Iterable[tuple[str, int]]:
+    """What may be known besides."""
+    system = one.plan.system
+    unmeasured = [i for i in range(system.n) if not _measured(one.everywhere, i)]
+    unbounded = [np.flatnonzero(~np.isfinite(np.asarray(b.width))) for b in (system.input_bounds, system.state_bounds)]
+    for kind, members in zip(("sensor", "input_bounds", "state_bounds"), (unmeasured, *unbounded), strict=True):
+        yield from ((kind, int(index)) for index in members[:_MOST])
+
+
+def _with(one: Changed, change: tuple[str, int], on: Enclosures, region: Interval) -> Changed:
+    """The plant with one thing more known."""
+    (kind, i), plan, system = change, one.plan, one.plan.system
+    changes = (*one.changes, change)
+    if kind == "sensor":
         T2 = np.pad(plan.feedthrough.T2, ((0, 1), (0, 1)))
         T2[-1, -1] = 1.0
         v = plan.noise.v
-        yield Changed(
-            "sensor",
-            i,
-            Plan(
-                _like(plan, H=np.vstack([system.H, np.zeros((1, p))])),
-                Noise(plan.noise.w, Interval(np.append(v.lower, -1.0), np.append(v.upper, 1.0))),
-                replace(plan.feedthrough, T2=T2),
-                plan.u_region,
-            ),
-            _with_row(here, i),
-            _with_row(everywhere, i),
-            on.outputs,
+        changed = Plan(
+            _like(plan, H=np.vstack([system.H, np.zeros((1, system.p))])),
+            Noise(plan.noise.w, Interval(np.append(v.lower, -1.0), np.append(v.upper, 1.0))),
+            replace(plan.feedthrough, T2=T2),
+            plan.u_region,
         )
-    for j in np.flatnonzero(~np.isfinite(np.asarray(known.width)))[:_MOST]:
-        box = _bounded(known, j, -1.0, 1.0)
-        changed = replace(plan, system=_like(plan, input_bounds=box))
-        yield Changed("input_bounds", int(j), changed, here, everywhere, on.outputs)
-    for i in np.flatnonzero(~np.isfinite(np.asarray(bounds.width)))[:_MOST]:
-        low, high = float(region.lower[i]), float(region.upper[i])
-        if not (np.isfinite([low, high]).all() and low < high):
-            low, high = low - 1.0 if np.isfinite(low) else -1.0, high + 1.0 if np.isfinite(high) else 1.0
-        box = _bounded(bounds, i, low, high)
-        changed = replace(plan, system=_like(plan, state_bounds=box))
-        yield Changed("state_bounds", int(i), changed, here, on.slopes(box), on.outputs)
+        return Changed(changed, _with_row(one.region, i), _with_row(one.everywhere, i), on.outputs, changes)
+    if kind == "input_bounds":
+        changed = replace(plan, system=_like(plan, input_bounds=_bounded(system.input_bounds, i, -1.0, 1.0)))
+        return replace(one, plan=changed, changes=changes)
+    low, high = float(region.lower[i]), float(region.upper[i])
+    if not (np.isfinite([low, high]).all() and low < high):
+        low, high = low - 1.0 if np.isfinite(low) else -1.0, high + 1.0 if np.isfinite(high) else 1.0
+    box = _bounded(system.state_bounds, i, low, high)
+    everywhere = on.slopes(box)
+    for sensor in one.sensors:
+        everywhere = _with_row(everywhere, sensor)
+    changed = replace(plan, system=_like(plan, state_bounds=box))
+    return Changed(changed, one.region, everywhere, on.outputs, changes)
 
 
 def _like(plan: Plan, **changes: Any) -> Any:
@@ -208,50 +251,17 @@ def _starts(one: Changed, problem: GainProblem, gain: np.ndarray) -> bool:
     R = (np.abs(one.everywhere.Z - C) + one.everywhere.Z_radius)[used]
     if np.isfinite(R).all() and spectral_radius(np.abs(N_z[:, used]) @ R) < 1:
         return True
-    slope, finite = _first_form(one)
+    slope, finite = first_form(one)
     matrix = np.eye(problem.n) + N_z[:, used] @ (slope - C)[used]
     return bool(finite[used].all()) and abs(np.linalg.det(matrix)) > _SINGULAR
 
 
-def _first_form(one: Changed) -> tuple[np.ndarray, np.ndarray]:
+def first_form(one: Changed) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (q, n) of the affine bounds of T2 g on the state bounds, and which of them have a finite remainder."""
     if one.everywhere.near_affine(one.everywhere.Z_radius):
         return one.everywhere.Z, np.full(len(one.everywhere.Z), True)
     form, _ = one.outputs(one.plan.system.state_bounds)
     slope = np.asarray(form.slope, np.float64)
     finite = np.isfinite(form.offset.lower) & np.isfinite(form.offset.upper)
-    if one.kind == "sensor":
-        return np.vstack([slope, np.eye(slope.shape[1])[one.index]]), np.append(finite, True)
-    return slope, finite
-
-
-def _recovers(one: Changed) -> bool:
-    """Do the measurements determine the state when nothing is known of the past: at once, or (where f and g are affine)
-    within n + 4 steps, whatever the unknown input does?"""
-    system = one.plan.system
-    bounded = np.eye(system.n)[np.isfinite(np.asarray(system.state_bounds.width))]
-    slope, finite = _first_form(one)
-    if _rank(np.vstack([slope[finite], bounded])) == system.n:
-        return True
-    if not one.everywhere.affine:
-        return False
-    free = ~np.isfinite(np.asarray(system.input_bounds.width))
-    G, H = np.asarray(system.G)[:, free], np.asarray(system.H)[:, free]
-    steps = system.n + 4
-    state = np.hstack([np.eye(system.n), np.zeros((system.n, steps * G.shape[1]))])
-    seen: list[np.ndarray] = []
-    for k in range(steps):
-        now = np.zeros((G.shape[1], state.shape[1]))
-        now[:, system.n + k * G.shape[1] : system.n + (k + 1) * G.shape[1]] = np.eye(G.shape[1])
-        seen += [one.everywhere.E @ state + H @ now, bounded @ state]
-        outputs = np.vstack(seen)
-        if _rank(outputs) == _rank(np.vstack([outputs, state])):
-            return True
-        state = one.everywhere.F @ state + G @ now
-    return False
-
-
-def _rank(matrix: np.ndarray) -> int:
-    norms = np.linalg.norm(matrix, axis=1, keepdims=True)
-    singular = np.linalg.svd(matrix / np.where(norms > 0, norms, 1.0), compute_uv=False)
-    return int((singular > _RANK * singular.max(initial=0.0)).sum()) if len(singular) else 0
+    measured = np.eye(slope.shape[1])[one.sensors]
+    return np.vstack([slope, measured]), np.append(finite, np.full(len(measured), True))

@@ -11,7 +11,7 @@ from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.framer import FramerGains, framer_gains
 from gsisio_jax.design.left_inverse import smallest_radius_inverse
 from gsisio_jax.design.planes import plane_bounds
-from gsisio_jax.design.region import find_region, grown_around
+from gsisio_jax.design.region import Near, find_region, grown_around
 from gsisio_jax.errors import FramerNotGuaranteed
 from gsisio_jax.inclusion.mixed_monotone import width_gain
 from gsisio_jax.interval.box import Interval
@@ -32,7 +32,7 @@ def design_prediction(
     left_inverse: LeftInverse | Any = "pseudo",
     allow_uncertified: bool = False,
     derivative: Interval | None = None,
-    around: Interval | None = None,
+    around: Near | None = None,
 ) -> PredictionObserver:
     """The paper's observer; arguments as in `design_observer`, which calls this.
 

@@ -22,10 +22,11 @@ def told(call: str, progress: bool | None, patience: float | None = None) -> Ite
 
     Args:
         call: what the line begins with.
-        progress: True writes it; None where standard error is a terminal; False never.
+        progress: True writes it; None where standard error is a terminal or the output of a notebook's cell; False
+            never.
         patience: seconds before it appears.
     """
-    if progress is False or (progress is None and not _terminal()):
+    if progress is False or (progress is None and not (_terminal() or _notebook())):
         yield lambda stage: None
         return
     stream, wait = sys.stderr, PATIENCE if patience is None else patience
@@ -59,5 +60,9 @@ def told(call: str, progress: bool | None, patience: float | None = None) -> Ite
 
 
 def _terminal() -> bool:
-    """A notebook's standard error is none."""
     return bool(getattr(sys.stderr, "isatty", lambda: False)())
+
+
+def _notebook() -> bool:
+    """Standard error of a Jupyter kernel is no terminal, but what a carriage return overwrites is overwritten there."""
+    return type(sys.stderr).__module__.partition(".")[0] == "ipykernel"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,17 @@ Around = Interval | Any
 """A state (n,), a box of states, or states or boxes over time (T, n)."""
 
 
-def find_region(system: System, steady_width: Callable[[Interval], np.ndarray], around: Interval | None) -> Interval:
+@dataclass(frozen=True)
+class Near:
+    """What a region is looked for around: the hull of what was given, whether that was a whole trajectory, and whether
+    boxes or states."""
+
+    box: Interval
+    along: bool
+    boxes: bool
+
+
+def find_region(system: System, steady_width: Callable[[Interval], np.ndarray], around: Near | None) -> Interval:
     """Grow a region until it has room for its own steady width.
 
     Around a point it is grown until it holds its steady width, and then enlarged as long as it does. Around a box it
@@ -35,10 +46,8 @@ def find_region(system: System, steady_width: Callable[[Interval], np.ndarray], 
 
     Source: theory 6.
     """
-    core = around
-    if core is None:
-        center = np.asarray(system.state_bounds.center, dtype=np.float64)
-        core = Interval(center, center)
+    center = np.asarray(system.state_bounds.center, dtype=np.float64)
+    core = Interval(center, center) if around is None else around.box
     point = not np.asarray(core.width).any()
     room = np.zeros(system.n)  # on both sides together around a point, on each side of a box
     for _ in range(_ROUNDS):
@@ -51,11 +60,11 @@ def find_region(system: System, steady_width: Callable[[Interval], np.ndarray], 
     where = str(np.asarray(core.lower).tolist())
     if not point:
         where += f" to {np.asarray(core.upper).tolist()}"
-    hint = (
-        "Where the plant runs elsewhere, give `around`: a state, a box or a trajectory (T, n). "
-        if around is None
-        else "Around a shorter part of the run there may be one. "
-    )
+    hint = "Around a shorter part of the run there may be one. "
+    if around is None:
+        hint = "Where the plant runs elsewhere, give `around`: a state, a box or a trajectory (T, n). "
+    elif not around.along:
+        hint = f"Around {'another state' if point else 'a smaller or another box'} there may be one. "
     raise NoDesignFound(
         f"design_observer: region='auto' met no region around {where} that holds its own steady width (last room "
         f"tried: {room.tolist()}). {hint}Smaller noise bounds or more outputs may help too. Boxes are certain even "
@@ -63,8 +72,8 @@ def find_region(system: System, steady_width: Callable[[Interval], np.ndarray], 
     )
 
 
-def read_around(system: System, around: Around, auto: bool) -> Interval | None:
-    """The box that a region is looked for around: the hull of what was given, within the state bounds.
+def read_around(system: System, around: Around, auto: bool) -> Near | None:
+    """What a region is looked for around: the hull of what was given, within the state bounds.
 
     Raises:
         ValueError: it has another shape, is not finite, has nothing in common with the state bounds, or a region was
@@ -96,13 +105,25 @@ def read_around(system: System, around: Around, auto: bool) -> Interval | None:
             f"of state {i + 1}: {rows[0][0, i]:g} to {rows[1][0, i]:g} first, and the bounds are {bounds.lower[i]:g} "
             f"to {bounds.upper[i]:g}"
         )
-    return Interval(np.where(known, lower, np.inf).min(0), np.where(known, upper, -np.inf).max(0))
+    hull = Interval(np.where(known, lower, np.inf).min(0), np.where(known, upper, -np.inf).max(0))
+    return Near(hull, along=len(shape) == 2, boxes=box)
 
 
-def grown_around(around: Interval | None, region: Interval) -> str:
-    """What a reader of the certificate should know of a region that was found without being told where; "" else."""
-    if around is not None:
+def grown_around(around: Near | None, region: Interval) -> str:
+    """What a reader of the certificate should know of a region that was found without being told of the whole run; ""
+    where all boxes of one were given."""
+    if around is not None and around.along and around.boxes:
         return ""
+    if around is not None and around.along:
+        return (
+            "the region has room for settled boxes along the states that were given; wider ones, as the first of a "
+            "run, leave it: give the boxes of an earlier estimate as `around`, and look at est.summary()"
+        )
+    if around is not None:
+        return (
+            "the region was grown around one state or box; a run that goes on elsewhere leaves it: give the trajectory "
+            "as `around`, and look at est.summary()"
+        )
     center = ", ".join(f"{value:.4g}" for value in np.asarray(region.center))
     return (
         f"the region was grown around ({center}), the centre of the state bounds; a run elsewhere leaves it: give "

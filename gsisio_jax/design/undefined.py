@@ -1,4 +1,4 @@
-"""Points of the region where f or g gives no number: where the promise of a certificate is void."""
+"""Points of the region where f or g gives no number: no width is promised on such a region."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FAR = 1e3  # an unbounded side is looked at as far as this
 
 
 def undefined_in(system: System, region: Interval, u_region: Interval) -> str | None:
-    """What a user should know: a point of the region, within the state bounds, at which f or g is NaN or infinite.
+    """Why no width can be promised: a point of the region, within the state bounds, at which f or g is NaN or infinite.
 
     Corners and random points are tried, so None is no proof.
     """
@@ -37,7 +37,7 @@ def undefined_in(system: System, region: Interval, u_region: Interval) -> str | 
                 if not np.isfinite(value).all():
                     place = ", ".join(f"{entry:.4g}" for entry in x)
                     return (
-                        f"{name} gives no number at x = ({place}), which lies in the region: nothing is promised of "
-                        "boxes that hold such states; give a smaller region, or `state_bounds`"
+                        f"no width is promised: {name} gives no number at x = ({place}), which lies in the region; "
+                        "give a region, or `state_bounds`, without such states"
                     )
     return None

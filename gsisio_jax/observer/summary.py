@@ -17,26 +17,33 @@ NEARLY_ALL = 0.75  # of the steps with measurements: so many conflicts are no fa
 
 @dataclass(frozen=True)
 class Outside:
-    """Steps for which no width is promised, because of where they are.
+    """Steps for which no width is promised, because of where they are or of what was measured.
 
     Attributes:
         steps: of the run.
-        outside: of them with the status OUTSIDE_REGION: the box or u of this step, or of the one before, is outside.
+        outside: of them without a promise: the box or u of this step, or of the one before, is outside (the status
+            OUTSIDE_REGION), or they are among the `unread`.
         boxes: steps whose box is not inside the region; None where it is not known.
         inputs: steps whose u is not inside `u_region`; None where it is not known.
+        unread: steps of which an output, or one of the step before, is missing, ambiguous or contradicted.
     """
 
     steps: int
     outside: int
     boxes: int | None = None
     inputs: int | None = None
+    unread: int = 0
 
     def __str__(self) -> str:
         if not self.outside:
             return f"0 of {self.steps} steps"
         reasons = [
             f"{what} at {count}"
-            for what, count in (("the box leaves the region", self.boxes), ("u leaves u_region", self.inputs))
+            for what, count in (
+                ("the box leaves the region", self.boxes),
+                ("u leaves u_region", self.inputs),
+                ("outputs are missing or contradicted", self.unread),
+            )
             if count
         ]
         why = f" ({', '.join(reasons)})" if reasons else ""
@@ -81,7 +88,7 @@ def summary(est: Estimate, observer: Any = None, u: Any = None) -> str:
     facts = [
         ("steps", f"{steps}"),
         ("conflicts", ": ".join(filter(None, (f"{conflicts}", units_hint(conflicts, steps))))),
-        ("missing", f"{missing} steps with missing entries"),
+        ("missing", f"{missing} steps with missing entries{', or such as are not believed' if conflicts else ''}"),
         ("unbounded", f"{_count(status, Status.UNBOUNDED)} steps with a state that is not bounded"),
         ("no promise", str(where(est, observer, u))),
     ]
@@ -101,7 +108,21 @@ def where(est: Estimate, observer: Any = None, u: Any = None) -> Outside:
         region = observer.certificate.region
         boxes = int(np.count_nonzero(beyond(est.state.lower, est.state.upper, region)))
         inputs = None if u is None else int(np.count_nonzero(beyond(u, u, observer.u_region)))
-    return Outside(status.size, _count(status, Status.OUTSIDE_REGION), boxes, inputs)
+    lacking = unread(status)
+    outside = lacking | (status & int(Status.OUTSIDE_REGION) != 0)
+    return Outside(status.size, int(outside.sum()), boxes, inputs, int(lacking.sum()))
+
+
+def unread(status: np.ndarray, before: bool = False) -> np.ndarray:
+    """Steps (..., T) whose outputs, or those of the step before, say less than the certificate counts on.
+
+    Args:
+        status: of the steps.
+        before: is that so of the step before the first one?
+    """
+    here = status & int(Status.MISSING | Status.AMBIGUOUS | Status.CONFLICT) != 0
+    last = np.concatenate([np.full((*here.shape[:-1], 1), before), here[..., :-1]], axis=-1)
+    return here | last
 
 
 def beyond(lower: Any, upper: Any, box: Any) -> np.ndarray:

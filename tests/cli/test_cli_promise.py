@@ -52,14 +52,31 @@ def test_only_many_conflicts_raise_the_question_of_units(conflicts, steps, said)
     assert ("Units?" in units_hint(conflicts, steps)) == said
 
 
+def test_steps_with_measurements_that_are_missing_or_contradicted_have_no_promise():
+    """The recursion counts on y of the step and of the one before; parts of a run are counted as the whole."""
+    status = np.array([0, 2, 0, 1, 32, 0, 0, 8])
+    found = where(SimpleNamespace(status=status, state=None))
+    assert found == Outside(8, 6, unread=5)
+    assert "outputs are missing or contradicted at 5" in str(found)
+    totals, problem, _ = run([0], [-1], [0])
+    assert (totals.unread, totals.outside) == (0, 0)
+    rows = np.zeros(8, record_type(1, 0, 1))
+    rows["status"] = status
+    certificate = SimpleNamespace(region=Interval([-1.0], [1.0]))
+    observer = SimpleNamespace(certificate=certificate, output_rows=((0,),))
+    for cut in range(1, 8):
+        totals = gather([rows[:cut], rows[cut:]], problem, observer)
+        assert (totals.unread, totals.outside) == (5, 6)
+
+
 def test_the_summary_of_an_estimate():
     state = Interval(np.array([[-2.0], [-1.0], [-0.5]]), np.array([[0.0], [1.0], [0.5]]))
     status = np.array([Status.OUTSIDE_REGION, Status.OUTSIDE_REGION | Status.MISSING, Status.OUTSIDE_REGION])
     est = SimpleNamespace(status=status, state=state, kept=None)
     certificate = SimpleNamespace(region=Interval([-1.0], [1.0]), self_consistent=True, certified=True)
     observer = SimpleNamespace(certificate=certificate, u_region=Interval([0.0], [1.0]))
-    assert where(est) == Outside(3, 3)
-    assert where(est, observer, [[0.5], [0.5], [2.0]]) == Outside(3, 3, 1, 1)
+    assert where(est) == Outside(3, 3, unread=2)  # and the step after that of which an output is missing
+    assert where(est, observer, [[0.5], [0.5], [2.0]]) == Outside(3, 3, 1, 1, 2)
     lines = summary(est, observer, [[0.5], [0.5], [2.0]]).splitlines()
     assert lines[0].split() == ["steps", "3"]
     assert lines[1].split() == ["conflicts", "0"]
@@ -80,4 +97,7 @@ def test_a_run_that_contradicts_its_bounds_throughout_has_an_exit_code_of_its_ow
     assert code == 3
     found = json.loads(out)
     assert "Units?" in found["doubt"]
-    assert found["outside"] == {"steps": 0, "boxes": 0, "inputs": 0}
+    alarms, steps = found["alarm_count"], found["steps"]
+    unread = found["outside"].pop("measurements")
+    assert found["outside"] == {"steps": unread, "boxes": 0, "inputs": 0}
+    assert alarms <= unread <= steps

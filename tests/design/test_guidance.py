@@ -1,5 +1,7 @@
 """What would help is computed: every suggestion works when it is followed, and what is not suggested does not."""
 
+import re
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -52,10 +54,49 @@ def test_suggestions_of_a_plant_without_an_observer_work_and_the_others_do_not()
             design(system)
 
 
-def test_where_one_thing_more_is_not_enough_that_is_said():
-    blind = gx.System(lambda x: 0.5 * x, lambda x: x[:1], G=np.eye(3), H=np.zeros((1, 3)))
-    with pytest.raises(gx.ObserverDoesNotExist, match="neither one more state measured nor one more bound"):
-        design(blind)
+def test_where_one_thing_more_is_not_enough_two_are_tried():
+    """Two arms with a torque each, whose angles are measured: each torque needs something."""
+
+    def arms(more=(), **known):
+        def f(x):
+            return jnp.stack([x[0] + 0.1 * x[2], x[1] + 0.1 * x[3], x[2] - 0.1 * jnp.sin(x[0]), x[3] - 0.1 * x[1]])
+
+        rows = [0, 1, *more]
+        G = np.array([[0.0, 0], [0, 0], [0.1, 0], [0, 0.1]])
+        system = gx.System(f, lambda x: jnp.stack([x[i] for i in rows]), G=G, H=np.zeros((len(rows), 2)), **known)
+        noise = gx.Noise(ball(*[0.01] * 4), Interval.symmetric([0.1] * len(rows)))
+        return gx.design_observer(system, noise, ball(*[2.0] * 4), missing=False, window=1)
+
+    with pytest.raises(gx.ObserverDoesNotExist) as error:
+        arms()
+    _, head, *lines = str(error.value).splitlines()
+    assert "neither one more state measured nor one more bound" in head
+    assert head.endswith("two together are:")
+    inf = np.inf
+    ways = {
+        "measure states 3 and 4 as well": {"more": (2, 3)},
+        "`input_bounds` with two finite sides for inputs 1 and 2": {"input_bounds": ball(3.0, 3.0)},
+        "`state_bounds` with two finite sides for states 3 and 4": {"state_bounds": ball(inf, inf, 2.0, 2.0)},
+        "measure state 3 as well, and `input_bounds` with two finite sides for input 2": {
+            "more": (2,), "input_bounds": ball(inf, 3.0),
+        },
+        "measure state 3 as well, and `state_bounds` with two finite sides for state 4": {
+            "more": (2,), "state_bounds": ball(inf, inf, inf, 2.0),
+        },
+    }  # fmt: skip
+    for way, known in ways.items():
+        assert f"  {way}: widths settle;" in lines
+        assert arms(**known).certificate.certified
+    for known in ({"more": (2,)}, {"more": (2,), "input_bounds": ball(3.0, inf)}):
+        with pytest.raises(gx.ObserverDoesNotExist):
+            arms(**known)
+
+
+def test_where_two_things_more_are_not_enough_that_is_said():
+    blind = gx.System(lambda x: 0.5 * x, lambda x: x[:1], G=np.eye(4), H=np.zeros((1, 4)))
+    noise = gx.Noise(ball(*[0.01] * 4), ball(0.1))
+    with pytest.raises(gx.ObserverDoesNotExist, match=r"is enough by itself, nor are two of them together\.$"):
+        gx.design_observer(blind, noise, ball(*[2.0] * 4), missing=False)
 
 
 def test_a_smaller_region_is_proposed_only_where_it_works():
@@ -87,6 +128,52 @@ def test_what_would_make_widths_settle_is_noted():
         "widths would settle with one of these (tried): measure state 2 as well; or `state_bounds` with two finite "
         "sides for state 2",
     )
+
+
+A_FOUR = np.array([[0.7, 0.1, 0, 0], [0, 0.6, 0.1, 0], [0, 0, 0.8, 0.1], [0.1, 0, 0, 0.5]])
+GAPS = {
+    # A bounded nonlinearity, one output of two states that the input moves.
+    "tanh chain": (
+        lambda x: jnp.stack([0.8 * x[0] + 0.1 * jnp.tanh(x[1]), 0.6 * x[1] + 0.1 * x[0], 0.5 * x[2] + 0.2 * x[1]]),
+        lambda x: [x[0] + 0.3 * x[2]], [[1.0], [0.0], [0.5]], [[0.0]], 3,
+    ),
+    # Two inputs, one of them in an output: the bounds of some states say where others are, but not to boxes.
+    "four states": (
+        lambda x: A_FOUR @ x, lambda x: [x[0] + x[3], x[1]], [[1.0, 0], [0, 0], [0, 0], [0.5, 0]],
+        [[0.0, 0], [0, 1.0]], 4,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", GAPS)
+def test_what_is_said_to_bring_boxes_back_does_and_nothing_else(name):
+    """Every sensor and bound by itself, against the recovery of a design with it."""
+    f, g, G, H, n = GAPS[name]
+    p = len(G[0])
+
+    def promise(more=(), **known):
+        rows = np.vstack([H, np.zeros((len(more), p))])
+        system = gx.System(f, lambda x: jnp.stack([*g(x), *(x[i] for i in more)]), G=G, H=rows, **known)
+        noise = gx.Noise(ball(*[0.01] * n), ball(*[0.1] * len(rows)))
+        region = ball(*[2.0] * n)
+        return gx.design_observer(system, noise, region, window=1, cells=1, sweeps=1, certify=False).certificate
+
+    def only(size, i, radius):
+        return ball(*np.where(np.arange(size) == i, radius, np.inf))
+
+    found = promise()
+    assert found.recoverable is False
+    bound = "`{}_bounds` with two finite sides for {} "
+    changes = [("measure state {} as well", i, {"more": (i,)}) for i in range(n)]
+    changes += [(bound.format("input", "input") + "{}", j, {"input_bounds": only(p, j, 3.0)}) for j in range(p)]
+    changes += [(bound.format("state", "state") + "{}", i, {"state_bounds": only(n, i, 2.0)}) for i in range(n)]
+    said = {}
+    for way in found.notes[-1].partition("(tried): ")[2].split("; or "):
+        kind, numbers = re.match(r"(.*(?:state|input) )([\d, or]+)", way).groups()
+        said[kind] = set(re.findall(r"\d+", numbers))
+    for text, index, known in changes:
+        expected = str(index + 1) in said.get(text.partition("{")[0], ())
+        assert promise(**known).recoverable is expected, (text, index)
 
 
 def test_what_would_bring_boxes_back_after_a_lost_row_is_noted():

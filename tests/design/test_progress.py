@@ -49,6 +49,19 @@ def test_silence_off_a_terminal_where_it_is_unwanted_and_before_its_time(monkeyp
     assert quiet.getvalue() == ""
 
 
+def test_a_notebook_shows_it_unasked(monkeypatch):
+    """Jupyter's stream is known by where its class is from; there carriage returns overwrite as on a terminal."""
+
+    class OutStream(io.StringIO):
+        __module__ = "ipykernel.iostream"
+
+    stream = OutStream()
+    monkeypatch.setattr(sys, "stderr", stream)
+    with told("design_observer", None, patience=0.0):
+        wait_for(stream, "design_observer: starting, ")
+    assert stream.getvalue().endswith("\r")
+
+
 def test_asked_for_it_is_shown_anywhere_and_an_error_wipes_it_out(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)

@@ -8,7 +8,7 @@ import pytest
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
-from gsisio_jax.design.cells import _moved_freely
+from gsisio_jax.design.cells import _moved_freely, _straight
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.observer.cells import counts
 
@@ -61,6 +61,31 @@ def test_boxes_are_near_the_set_that_agrees(run):
         assert (found.state.lower[k] <= x[k]).all()
         assert (x[k] <= found.state.upper[k]).all()
         assert (np.asarray(found.state.width[k]) <= 1.5 * np.array(_hull(y[k], x[k])) + 0.002).all(), k
+
+
+def test_boxes_of_a_few_metres_in_small_bounds_are_cut_as_well():
+    """2 m are less than a tenth of bounds of 30 m, but far more than the .13 m that ranges of 5 cm leave."""
+    beacons = np.array([[0.0, 0.0], [40.0, 5.0], [10.0, 45.0]])
+
+    def outputs(x):
+        away = x - beacons
+        return [*jnp.hypot(away[:, 0], away[:, 1]), jnp.arctan2(away[0, 1], away[0, 0])]
+
+    bounds = Interval([5.0, 5.0], [35.0, 35.0])
+    system = gx.System(lambda x: x, outputs, G=np.eye(2), H=np.zeros((4, 2)), state_bounds=bounds)
+    noise = gx.Noise(Interval.symmetric([0.01, 0.01]), Interval.symmetric(NOISE))
+    region = Interval([10.0, 10.0], [30.0, 30.0])
+    observer = gx.design_observer(system, noise, region, missing=False, sweeps=2, window=1)
+    assert observer.cells == (8, 8)
+    # What straight outputs leave, against the set that agrees: outputs are nearly straight on a tenth of a metre.
+    at = np.array([20.0, 20.0])
+    grid = np.arange(-0.25, 0.25, 0.001)
+    px, py = np.meshgrid(at[0] + grid, at[1] + grid, indexing="ij")
+    seen = [*(np.hypot(px - b[0], py - b[1]) for b in beacons), np.arctan2(py - beacons[0, 1], px - beacons[0, 0])]
+    y = np.array([np.asarray(value) for value in outputs(at)])
+    agrees = np.all([abs(s - value) <= bound for s, value, bound in zip(seen, y, NOISE, strict=True)], axis=0)
+    set_width = [np.ptp(px[agrees]), np.ptp(py[agrees])]
+    np.testing.assert_allclose(_straight(observer, Interval.entire(0)), set_width, atol=0.003)
 
 
 def test_a_lost_range_widens_and_a_wrong_one_is_found(run):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from information import changed
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
@@ -60,6 +61,25 @@ def test_true_bounds_never_widen_a_box(name):
     without, y = widths(make, {})
     with_bounds, _ = widths(make, known, y)
     assert (with_bounds[-20:] <= without[-20:] * (1 + 1e-6)).all()
+
+
+def test_true_bounds_of_an_input_do_not_widen_what_slices_promise():
+    """Counted over the whole region the gain that leans on the bounds is better (59.6 against 70); slice by slice the
+    other one is (17.4), and boxes are held to the promise."""
+    tank = gx.examples.load("quadruple_tank")
+    d = tank.record().d
+    bounds = Interval(d.min(0) - 1.5, d.max(0) + 13.0)
+    promises = []
+    for known in ({}, {"input_bounds": bounds}):
+        observer = gx.design_observer(
+            changed(tank.system, **known), tank.noise, tank.region, u_region=tank.u_region, missing=False, sweeps=1,
+            split=8, window=1,
+        )  # fmt: skip
+        promises.append(observer.certificate)
+    without, with_bounds = promises
+    assert without.self_consistent
+    assert with_bounds.self_consistent
+    assert (with_bounds.steady_width <= without.steady_width * (1 + 1e-6)).all()
 
 
 def test_rows_for_the_first_steps_close_the_room_that_nobody_measures():

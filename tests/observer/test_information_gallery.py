@@ -22,7 +22,6 @@ LEFT = {
     # Boxes of f and g on a smaller box need not lie in those on a larger one.
     ("paper", "input bounds"): 3e-4,
     # Rows over several steps are chosen on simulated runs, and other widths give other rows.
-    ("quadruple_tank", "input bounds"): 4.2e-3,
     ("building", "output"): 1.7e-2,
 }
 CHEAP = ("sir",)  # more of them would take too long for a default run
