@@ -109,7 +109,7 @@ def _points(lower, upper, random) -> list[np.ndarray]:
 def _bounds_of(found: Expansion, weights, dtype, mode: str = "outward"):
     """Of rows on boxes: joint and natural bounds, slopes, offsets."""
 
-    @jax.jit
+    @in_numpy
     @jax.vmap
     def call(lower, upper):
         with rounding.using(mode):
@@ -206,7 +206,7 @@ def test_no_wider_than_by_the_rules_of_the_engine():
     far = ~np.isfinite(lower).all(1) | ~np.isfinite(upper).all(1)
     found = _expansion(np.float64)
 
-    @jax.jit
+    @in_numpy
     @jax.vmap
     def both(lower, upper):
         with rounding.using("outward"):
@@ -330,7 +330,7 @@ def test_known_inputs_and_constants():
     found = expand(function, 2, 2, np.float64)
     assert found is not None
 
-    @jax.jit
+    @in_numpy
     @jax.vmap
     def call(lower, upper, u):
         with rounding.using("outward"):
