@@ -48,8 +48,8 @@ def to_dataset(
         certificate: the observer's certificate; its text becomes the attribute ``certificate``.
 
     Returns:
-        ``xarray.Dataset`` with the dimension ``time``: ``<signal>_lower`` and ``<signal>_upper`` of every state and
-        input, ``measured_<output>``, ``status`` (a bit mask with CF flag attributes) and ``margin``. The input box at
+        xarray.Dataset: with the dimension ``time``, ``<signal>_lower`` and ``<signal>_upper`` of every state and input,
+        ``measured_<output>``, ``status`` (a bit mask with CF flag attributes) and ``margin``. The input box at
         step k is that of d_k, which needs y_{k+1}: its last entry is NaN. The attribute ``alarms`` is a JSON list of
         ``{time, kind, index, gap, text}``; of an estimate with a delay, `delay` is its number of steps.
 

@@ -41,7 +41,7 @@ def load_observer(path: str | os.PathLike[str], system: System, compare: Compare
             same to rounding.
 
     Returns:
-        `Observer`, `DelayedObserver` or `PredictionObserver`, in the floating type of the one that was saved: what was
+        Observer | DelayedObserver | PredictionObserver: in the floating type of the one that was saved. What was
         designed in float64 stays so also where ``jax_enable_x64`` is off, and is brought to float32 with the data.
 
     Raises:

@@ -323,8 +323,8 @@ def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
         b: a box of the same shape.
 
     Returns:
-        The intersection, and the slack ``min(a.upper - b.lower, b.upper - a.lower)``: how far one box could be moved
-        before they miss each other. A negative slack is the size of the gap; there the first box is returned
+        (Interval, slack): the intersection, and ``min(a.upper - b.lower, b.upper - a.lower)``, how far one box could be
+        moved before they miss each other. A negative slack is the size of the gap; there the first box is returned
         unchanged, so the result is never crossed: the caller must look at the slack. A side of b that is NaN (it
         overflowed) is passed over.
     """
