@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
 from gsisio_jax._version import __version__
 from gsisio_jax.interval.reading import read_array
 from gsisio_jax.observer.status import flag_attributes
 
 
+@named_arguments
 def to_dataset(
     est: Any,
     *,

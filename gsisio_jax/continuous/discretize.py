@@ -10,6 +10,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.continuous import maps, sides
 from gsisio_jax.continuous.arguments import Arguments, cells_of, check_bounded, read
 from gsisio_jax.continuous.bound import StepError
@@ -21,6 +22,7 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.plant.calls import check_map, takes_u
 
 
+@named_arguments
 def discretize(
     f: Callable[..., Any],
     dt: float,

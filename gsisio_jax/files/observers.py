@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.files.container import read, restore, write
 from gsisio_jax.files.systems import Compare, check_system, described
 from gsisio_jax.interval.box import is_concrete
@@ -24,6 +25,7 @@ def save_observer(path: str | os.PathLike[str], observer: Any) -> None:
     write("Observer.save", path, "observer", described(observer), observer)
 
 
+@named_arguments
 def load_observer(path: str | os.PathLike[str], system: System, compare: Compare = "program") -> Any:
     """An observer that `Observer.save` has written. Its boxes are those of the observer that was saved, bit for bit.
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.paper.lipschitz import spectral_norm
 from gsisio_jax.paper.stability import Stability
@@ -46,6 +47,7 @@ class WidthBounds(NamedTuple):
     input_elementwise_limit: np.ndarray
 
 
+@named_arguments
 def width_bounds(stability: Stability, initial_width: Any, steps: int, printed: bool = False) -> WidthBounds:
     """Upper bounds of the widths of the paper's recursion with decomposition bounds.
 
