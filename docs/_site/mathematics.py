@@ -47,7 +47,8 @@ def _name(part: ElementTree.Element) -> bool:
     """A name of several letters (sin, rank, eps), or one with an index."""
     if _tag(part) in ("msub", "msup", "msubsup"):
         return _name(part[0])
-    return _tag(part) == "mi" and len(part.text or "") > 1
+    text = part.text or ""
+    return _tag(part) == "mi" and len(text) > 1 and text.isalpha()  # .5 is an identifier to the converter
 
 
 def _spaced(formula: str, made: str) -> str:

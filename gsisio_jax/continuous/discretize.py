@@ -67,7 +67,7 @@ def discretize(
             bound; JAX's default type if not given.
 
     Returns:
-        A `Discretization`: f, error, G, and methods that make a `System` and a `Noise` of it.
+        Discretization: f, error, G, and methods that make a `System` and a `Noise` of it.
 
     Raises:
         ValueError: what was given does not fit; f jumps, or is not as smooth as the method needs, on the region; dt is
@@ -78,8 +78,7 @@ def discretize(
     >>> bool(model.error.upper[0] < 4e-5)
     True
 
-    Source: theory 15; the error is a Taylor remainder on an a-priori enclosure, see R. E. Moore, *Interval Analysis*,
-        1966.
+    Source: theory 15; the error is a Taylor remainder on an a-priori enclosure, see Moore, *Interval Analysis*, 1966.
     """
     given = read(dt, method, order, region, u_bounds, G, input_bounds, disturbance, dtype)
     with _named():

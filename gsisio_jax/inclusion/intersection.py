@@ -58,7 +58,7 @@ def bound(
         rounding: as in `natural`.
 
     Returns:
-        A function that returns an `AffineForm`: its range is the intersection of all ranges; its slope is that of the
+        Callable: it returns an `AffineForm`. Its range is the intersection of all ranges; its slope is that of the
         affine form, else of the mean-value form, else zero.
 
     Raises:

@@ -61,7 +61,7 @@ def width_bounds(stability: Stability, initial_width: Any, steps: int, printed: 
         printed: Lemma 5's own formulas exactly as printed.
 
     Returns:
-        `WidthBounds`. For L >= 1 the sequences are finite (L = 1: ``k ||dz||`` is added) and the limits infinite.
+        WidthBounds: for L >= 1 the sequences are finite (``k ||dz||`` is added where L = 1) and the limits infinite.
 
     Raises:
         ValueError: the width has the wrong shape or is negative or not finite, or `steps` is negative.
