@@ -227,7 +227,10 @@ def _matrix(name: str, value: Any, shape: tuple[int, int] | None = None) -> np.n
             f"System: `{name}` is traced by JAX, and must be known; make the System outside of jit, vmap and grad"
         ) from error
     if matrix.ndim != 2:
-        raise ValueError(f"System: {name} must be a matrix (2 dimensions), got shape {matrix.shape}")
+        raise ValueError(
+            f"System: {name} must be a matrix (2 dimensions), got shape {matrix.shape}; "
+            "one column is written [[a], [b]], a row for each state (G, B) or output (H, D)"
+        )
     if shape is not None and matrix.shape != shape:
         raise ValueError(f"System: {name} must have shape {shape}, got {matrix.shape}")
     if not np.isfinite(matrix).all():

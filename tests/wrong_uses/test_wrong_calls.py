@@ -100,7 +100,7 @@ CALLS = {
         "got 0",
     ),
     "u of no size": (plant(f_of_u), "System: f or g takes u", "m=..."),
-    "G a column": (plant(G=[1.0, 0.0], H=[0.0]), "System: G must be a matrix", "(2,)"),
+    "G a column": (plant(G=[1.0, 0.0], H=[0.0]), "System: G must be a matrix", "(2,)", "[[a], [b]]"),
     "G and H": (plant(G=[[1.0], [0]], H=[[0.0, 1.0]]), "System: G has shape (2, 1)", "one column per unknown input"),
     "G for H": (plant(G=[[0.0]], H=[[1.0], [0.0]]), "System: ", "rows of"),
 }
