@@ -30,6 +30,9 @@ class Simulation(NamedTuple):
 def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = None) -> Simulation:
     """Simulate the plant with noise drawn uniformly from its bounds.
 
+    ``state_bounds`` and ``input_bounds`` of the system are not enforced. A record that leaves them is not one of this
+    system, and boxes need not hold it.
+
     Args:
         system: the plant.
         key: a key of `jax.random`, or an integer seed.
