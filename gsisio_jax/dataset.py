@@ -126,7 +126,7 @@ def alarm_records(est: Any, time: Any, **labels: Any) -> list[dict[str, Any]]:
             `Alarm.describe`.
 
     Returns:
-        One dictionary per alarm: ``time``, ``step``, ``kind``, ``index``, ``gap`` (unit of the component) and
+        list[dict]: one for each alarm, with ``time``, ``step``, ``kind``, ``index``, ``gap`` (unit of the component) and
         ``text``, a sentence.
     """
     return [

@@ -108,6 +108,11 @@ def test_formulas_that_browsers_would_show_wrongly_are_errors(formula, named):
         hook("mathematics").mathml(formula, "inline")
 
 
+def test_a_session_of_a_docstring_is_one_block():
+    text = "Before.\n\n    >>> print(table)\n    head\n      1  2\n\nAfter."
+    assert "```pycon\n    >>> print(table)\n    head\n      1  2\n    ```\n" in hook("docstrings").fenced(text)
+
+
 def test_names_that_share_a_line_of_a_docstring_have_their_own_type():
     import griffe
 

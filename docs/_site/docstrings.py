@@ -7,7 +7,7 @@ from typing import Any
 
 import griffe
 
-SESSION = re.compile(r"^(?P<indent> *)>>> .*\n(?:(?P=indent)\S.*\n?)*", re.MULTILINE)
+SESSION = re.compile(r"^(?P<indent> *)>>> .*\n(?:(?P=indent).*\S.*\n?)*", re.MULTILINE)
 # "K, L: text": the parser would take the second name for the type of the first.
 NAMES = re.compile(r"^( +(?:\w+, )+\w+)(?=: )", re.MULTILINE)
 
