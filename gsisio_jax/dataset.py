@@ -126,8 +126,8 @@ def alarm_records(est: Any, time: Any, **labels: Any) -> list[dict[str, Any]]:
             `Alarm.describe`.
 
     Returns:
-        list[dict]: one for each alarm, with ``time``, ``step``, ``kind``, ``index``, ``gap`` (unit of the component) and
-        ``text``, a sentence.
+        list[dict]: one for each alarm, with ``time``, ``step``, ``kind``, ``index``, ``gap`` (unit of the component)
+        and ``text``, a sentence.
     """
     return [
         {
