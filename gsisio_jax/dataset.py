@@ -12,12 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
 from gsisio_jax._version import __version__
 from gsisio_jax.interval.reading import read_array
 from gsisio_jax.observer.status import flag_attributes
 
 
+@named_arguments
 def to_dataset(
     est: Any,
     *,
@@ -48,8 +50,8 @@ def to_dataset(
         certificate: the observer's certificate; its text becomes the attribute ``certificate``.
 
     Returns:
-        ``xarray.Dataset`` with the dimension ``time``: ``<signal>_lower`` and ``<signal>_upper`` of every state and
-        input, ``measured_<output>``, ``status`` (a bit mask with CF flag attributes) and ``margin``. The input box at
+        xarray.Dataset: with the dimension ``time``, ``<signal>_lower`` and ``<signal>_upper`` of every state and input,
+        ``measured_<output>``, ``status`` (a bit mask with CF flag attributes) and ``margin``. The input box at
         step k is that of d_k, which needs y_{k+1}: its last entry is NaN. The attribute ``alarms`` is a JSON list of
         ``{time, kind, index, gap, text}``; of an estimate with a delay, `delay` is its number of steps.
 
@@ -124,8 +126,8 @@ def alarm_records(est: Any, time: Any, **labels: Any) -> list[dict[str, Any]]:
             `Alarm.describe`.
 
     Returns:
-        One dictionary per alarm: ``time``, ``step``, ``kind``, ``index``, ``gap`` (unit of the component) and
-        ``text``, a sentence.
+        list[dict]: one for each alarm, with ``time``, ``step``, ``kind``, ``index``, ``gap`` (unit of the component)
+        and ``text``, a sentence.
     """
     return [
         {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import re
 from html.parser import HTMLParser
@@ -12,6 +13,7 @@ import pytest
 import gsisio_jax as gx
 
 ROOT = Path(__file__).parents[1]
+SITE = ROOT / "docs" / "_site"
 LOADED = {"script": "src", "link": "href", "img": "src", "iframe": "src", "source": "src"}
 
 
@@ -72,6 +74,53 @@ def test_every_formula_is_rendered(site):
         assert site[page].formulas >= formulas(source.read_text(encoding="utf-8")), page
         assert not re.search(r"\\[a-z]{2,}|\$", "".join(site[page].text)), page
     assert site["theory.html"].formulas > 800
+
+
+def hook(name):
+    spec = importlib.util.spec_from_file_location(name, SITE / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    spec.loader.exec_module(module := importlib.util.module_from_spec(spec))
+    return module
+
+
+def test_formulas_are_what_browsers_show():
+    mathml, space = hook("mathematics").mathml, '<mspace width="0.167em" />'
+    # Names stand apart from what they are applied to, but not from brackets or their own index.
+    assert f"<mi>cos</mi>{space}<mi>m</mi>{space}<mi>cos</mi>{space}<mi>r</mi>" in mathml(r"\cos m\cos r", "inline")
+    assert f"<mn>2</mn>{space}<mi>eps</mi>" in mathml(r"2\mathrm{eps}", "inline")
+    assert "mspace" not in mathml(r"\sin(x)+\mathrm{clip}_Y(b)", "inline")
+    # A space of TeX that browsers would drop.
+    assert space in mathml(r"A\thinspace\delta", "inline")
+    assert "<msup><mrow>" in mathml(r"{\binom lq}^2", "inline")
+
+
+@pytest.mark.parametrize(
+    ("formula", "named"),
+    [
+        (r"\binom lq^2", "braces"),  # three parts and a power in one element
+        (r"\begin{aligned} a &= b \end{aligned}", "no MathML"),  # a bare ampersand
+        (r"\nosuch x", r"\nosuch"),
+    ],
+)
+def test_formulas_that_browsers_would_show_wrongly_are_errors(formula, named):
+    with pytest.raises(ValueError, match=re.escape(named)):
+        hook("mathematics").mathml(formula, "inline")
+
+
+def test_a_session_of_a_docstring_is_one_block():
+    text = "Before.\n\n    >>> print(table)\n    head\n      1  2\n\nAfter."
+    assert "```pycon\n    >>> print(table)\n    head\n      1  2\n    ```\n" in hook("docstrings").fenced(text)
+
+
+def test_names_that_share_a_line_of_a_docstring_have_their_own_type():
+    import griffe
+
+    code, joined = "class C:\n    K: int\n    L: float\n    M: int\n", hook("docstrings").joined
+    found = griffe.visit("m", filepath=Path("m.py"), code=code)["C"]
+    assert joined("    K, M: text", found) == "    K,\xa0M (int): text"
+    assert joined("    K, L: text", found) == "    K,\xa0L (int, float): text"
+    assert joined("    K, other: text", found) == "    K,\xa0other: text"
 
 
 def test_nothing_is_loaded_from_elsewhere(site):

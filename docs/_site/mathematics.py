@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import html as entities
+import itertools
 import re
 import unicodedata
 from typing import Any
+from xml.etree import ElementTree
 
 from latex2mathml.converter import convert
 
@@ -20,6 +22,12 @@ LETTERS |= {("double-struck", letter): found for letter, found in zip("CHNPQRZ",
 SIGN = re.compile(
     r"((?:<mo[^>]*>(?:[\[(,;]|&#x0002[8C];|&#x0005B;|&#x0003[BCDE];|&#x02264;|&#x02265;)</mo>))<mo>&#x02212;</mo>"
 )
+# A word in upright letters is one name.
+WORD = re.compile(r'<mrow>((?:<mi mathvariant="normal">[A-Za-z]</mi>){2,})</mrow>')
+SPACE = "http://www.w3.org/1998/Math/MathML"
+ElementTree.register_namespace("", SPACE)
+# How many parts these have. The converter gives the power of a binomial coefficient more: browsers show a row.
+PARTS = {"msub": 2, "msup": 2, "mfrac": 2, "mover": 2, "munder": 2, "mroot": 2, "msubsup": 3, "munderover": 3}
 BLOCK = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOTALL)
 
 
@@ -31,19 +39,58 @@ def _letter(match: re.Match[str]) -> str:
     return f'<{tag} mathvariant="normal">{found}</{tag}>'
 
 
+def _tag(part: ElementTree.Element) -> str:
+    return part.tag.removeprefix(f"{{{SPACE}}}")
+
+
+def _name(part: ElementTree.Element) -> bool:
+    """A name of several letters (sin, rank, eps), or one with an index."""
+    if _tag(part) in ("msub", "msup", "msubsup"):
+        return _name(part[0])
+    text = part.text or ""
+    return _tag(part) == "mi" and len(text) > 1 and text.isalpha()  # .5 is an identifier to the converter
+
+
+def _spaced(formula: str, made: str) -> str:
+    """Names stand apart from what they are applied to (sin x, 2 eps), unless that has brackets."""
+    try:
+        tree = ElementTree.fromstring(made)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"formula {formula!r}: latex2mathml makes no MathML of it ({error})") from error
+    for part in list(tree.iter()):
+        if len(part) != PARTS.get(_tag(part), len(part)):
+            raise ValueError(
+                f"formula {formula!r}: put what has an index or a power into braces, as in {{\\binom nk}}^2"
+            )
+        if _tag(part) not in ("math", "mrow", "mstyle"):
+            continue
+        between = [
+            i + 1
+            for i, (one, two) in enumerate(itertools.pairwise(part))
+            if (_name(one) or _name(two)) and not {_tag(one), _tag(two)} & {"mo", "mspace", "mtext"}
+        ]
+        for i in reversed(between):
+            part.insert(i, ElementTree.Element(f"{{{SPACE}}}mspace", width="0.167em"))
+    return ElementTree.tostring(tree, encoding="unicode")
+
+
 def mathml(formula: str, display: str) -> str:
     """MathML of TeX. The converter keeps what it does not know as text, which must not reach a reader."""
     made = convert(entities.unescape(formula).strip(), display=display)
     unknown = re.findall(r"\\[A-Za-z]+", re.sub(r"<annotation.*?</annotation>", "", made, flags=re.DOTALL))
     if unknown:
         raise ValueError(f"formula {formula!r}: latex2mathml does not know {unknown[0]}")
+    made = WORD.sub(lambda match: f"<mi>{re.sub('<[^>]*>', '', match[1])}</mi>", made)
+    made = made.replace('width="thinmathspace"', 'width="0.167em"')  # browsers know no names of widths
     made = VARIANT.sub(_letter, made)
     if left := re.search(r'mathvariant="(?!normal)([a-z-]+)"', made):
         raise ValueError(f"formula {formula!r}: no browser shows mathvariant {left[1]!r}")
     made = SIGN.sub(r'\1<mo form="prefix">&#x02212;</mo>', made)
     made = re.sub(r"<mi>(&#x000B1;)</mi>", r"<mo>\1</mo>", made)
     # Bars are fences here, never a relation: no space around them.
-    return made.replace("<mo>&#x0007C;</mo>", '<mo fence="true" stretchy="false" lspace="0" rspace="0">|</mo>')
+    for bar in ("&#x0007C;", "&#x02016;"):
+        made = made.replace(f"<mo>{bar}</mo>", f'<mo fence="true" stretchy="false" lspace="0" rspace="0">{bar}</mo>')
+    return _spaced(formula, made)
 
 
 def _inline(formula: str) -> str:

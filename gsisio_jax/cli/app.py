@@ -55,6 +55,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
+def _folder(name: str) -> Path:
+    """Of ``--out``. An empty one, as of a variable that is not set, would be the folder at hand."""
+    if not name:
+        raise argparse.ArgumentTypeError('must be the name of a folder, got ""; the one at hand is "."')
+    return Path(name)
+
+
 def _parser() -> argparse.ArgumentParser:
     form = argparse.RawDescriptionHelpFormatter
     layout = {"epilog": EXAMPLES, "formatter_class": form}
@@ -73,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     estimate.add_argument(
         "table", metavar="TABLE", nargs="?", help="a table in the place of that of CONFIG; - is standard input"
     )
-    estimate.add_argument("--out", metavar="DIR", type=Path, help="folder of the files (default: results/NAME)")
+    estimate.add_argument("--out", metavar="DIR", type=_folder, help="folder of the files (default: results/NAME)")
     estimate.add_argument(
         "--follow", action="store_true", help="read a growing file or standard input, print a line of JSON per step"
     )
@@ -95,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         "examples", help="list the built-in examples, or write one out to start from", **layout
     )
     examples.add_argument("name", metavar="NAME", nargs="?", help="the example to write; left out: list all of them")
-    examples.add_argument("--out", metavar="DIR", type=Path, help="folder of its files (default: here)")
+    examples.add_argument("--out", metavar="DIR", type=_folder, help="folder of its files (default: here)")
     examples.add_argument("--debug", action="store_true", help="show the full traceback of every error")
     examples.set_defaults(command=_examples)
 
@@ -103,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
         "init", help="write a configuration and a plant to fill in, for a table", epilog=INIT, formatter_class=form
     )
     init.add_argument("table", metavar="LOG", help="a CSV or Parquet file of measurements")
-    init.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of the files (default: here)")
+    init.add_argument("--out", metavar="DIR", type=_folder, default=Path(), help="folder of the files (default: here)")
     init.add_argument("--debug", action="store_true", help="show the full traceback of every error")
     init.set_defaults(command=_init)
 
@@ -112,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
         ("monte-carlo", MONTE_CARLO, "simulated runs, every box checked against the truth", _monte_carlo),
     ):
         study = commands.add_parser(name, parents=[common], help=text, epilog=epilog, formatter_class=form)
-        study.add_argument("--out", metavar="DIR", type=Path, help="folder of the files (default: results/NAME)")
+        study.add_argument("--out", metavar="DIR", type=_folder, help="folder of the files (default: results/NAME)")
         study.add_argument("--fresh", action="store_true", help="begin anew: delete the stored study of an earlier run")
         study.add_argument(
             "--progress", choices=("auto", "never"), default="auto", help="progress bars; auto: only on a terminal"
@@ -122,7 +129,7 @@ def _parser() -> argparse.ArgumentParser:
     reproduce = commands.add_parser(
         "reproduce", help="the paper's example: every printed number beside the computed one, figures 2 and 3", **layout
     )
-    reproduce.add_argument("--out", metavar="DIR", type=Path, help="folder of the files (default: results/paper)")
+    reproduce.add_argument("--out", metavar="DIR", type=_folder, help="folder of the files (default: results/paper)")
     reproduce.add_argument("--progress", choices=("auto", "always", "never"), default="auto", help="progress bar")
     reproduce.add_argument("--debug", action="store_true", help="show the full traceback of every error")
     reproduce.set_defaults(command=_reproduce)

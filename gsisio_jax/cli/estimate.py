@@ -154,6 +154,12 @@ def _draw(outputs: OutputsPart, file: str) -> Callable[[Labelled, Path], None]:
     """What draws the picture: the user's own function, which is given all rows, or the library's."""
     need("matplotlib", extra="plot", purpose="drawing the picture")
     if outputs.draw is None:
+        from ..plot.style import check_picture
+
+        try:
+            check_picture(f"{file}: outputs.picture", outputs.picture or "boxes.png")
+        except ValueError as error:
+            raise UserError(str(error)) from error
         return _draw_plainly
     own = resolve(outputs.draw, f"{file}: outputs.draw")
 

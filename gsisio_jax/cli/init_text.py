@@ -83,8 +83,10 @@ upper = "FILL_IN"
 [table]
 file = {_quoted(file)}
 {_found(dialect)}{_clock(clock)}
-# Columns of numbers, in the order of y in plant.py. Known inputs go to u = [...].
+# Columns of numbers, in the order of y in plant.py. Known inputs go to u = [...]; then it is f(x, u) and
+# gx.System(..., m=1), and a table [u_region] with lower and upper holds the values that they can take.
 y = [{", ".join(_quoted(column.name) for column in used)}]
+# columns = {{{_quoted(used[0].name) if used else "level"} = {{unit = "mV"}}}}  # cells in mV, km/h, ... become V, m/s
 {_missing(columns)}
 # What was found in the columns:
 {_columns(columns, used)}

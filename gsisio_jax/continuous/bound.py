@@ -43,6 +43,16 @@ _ROUNDS, _TIGHTER = 40, 3
 _INFLATION = 0.1
 
 
+def _by_width(found: Sides, x: Sides) -> Sides:
+    more = _INFLATION * (found[1] - found[0]) + 1e-300
+    return more, more
+
+
+def _by_way(found: Sides, x: Sides) -> Sides:
+    """A part of the way that the plant moves beyond x, on either side."""
+    return _INFLATION * (x[0] - found[0]) + 1e-300, _INFLATION * (found[1] - x[1]) + 1e-300
+
+
 @dataclass
 class StepError:
     """Bounds of one method on boxes of states.
@@ -79,6 +89,14 @@ class StepError:
 
     def enclosure(self, x: Sides) -> Sides:
         """A box that holds every solution over a step that starts in x."""
+        try:
+            return self._enclosure(x, _by_width)
+        except ValueError:
+            # A tenth of a wide region may be far beyond what a short step can reach: where f has no bound, perhaps.
+            return self._enclosure(x, _by_way)
+
+    def _enclosure(self, x: Sides, more: Callable[[Sides, Sides], Sides]) -> Sides:
+        """That box, looked for in boxes that grow by `more` each time. Any one that passes the test is right."""
         wide, around = sides.symmetric(self.spread), x
         length = np.zeros(()), np.asarray(self.h)
 
@@ -102,8 +120,8 @@ class StepError:
                     around, found = found, image
                 return around
             found = sides.hull([found, around])
-            more = _INFLATION * (found[1] - found[0]) + 1e-300
-            around = found[0] - more, found[1] + more
+            below, above = more(found, x)
+            around = found[0] - below, found[1] + above
         raise ValueError(
             f"discretize: a step of dt = {self.h:g} is too long to enclose the plant on {box_text(x)} (boxes "
             "kept growing); give a shorter dt, a smaller region, or more cells"

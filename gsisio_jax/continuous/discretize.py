@@ -10,6 +10,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.continuous import maps, sides
 from gsisio_jax.continuous.arguments import Arguments, cells_of, check_bounded, read
 from gsisio_jax.continuous.bound import StepError
@@ -21,6 +22,7 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.plant.calls import check_map, takes_u
 
 
+@named_arguments
 def discretize(
     f: Callable[..., Any],
     dt: float,
@@ -65,7 +67,7 @@ def discretize(
             bound; JAX's default type if not given.
 
     Returns:
-        A `Discretization`: f, error, G, and methods that make a `System` and a `Noise` of it.
+        Discretization: f, error, G, and methods that make a `System` and a `Noise` of it.
 
     Raises:
         ValueError: what was given does not fit; f jumps, or is not as smooth as the method needs, on the region; dt is
@@ -76,8 +78,7 @@ def discretize(
     >>> bool(model.error.upper[0] < 4e-5)
     True
 
-    Source: theory 15; the error is a Taylor remainder on an a-priori enclosure, see R. E. Moore, *Interval Analysis*,
-        1966.
+    Source: theory 15; the error is a Taylor remainder on an a-priori enclosure, see Moore, *Interval Analysis*, 1966.
     """
     given = read(dt, method, order, region, u_bounds, G, input_bounds, disturbance, dtype)
     with _named():

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.continuous import maps
 from gsisio_jax.continuous.hold import held
 from gsisio_jax.interval.reading import is_whole, read_array
@@ -16,6 +17,7 @@ from gsisio_jax.plant.system import System
 _CALL = "from_state_space"
 
 
+@named_arguments
 def from_state_space(
     sys: Any,
     *,

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.design.abstraction_program import gap, planes_at_vertices
 from gsisio_jax.design.abstraction_proof import prove
 from gsisio_jax.design.abstraction_sigma import amount, refusal, sigma_of, values_at
@@ -25,6 +26,7 @@ from gsisio_jax.interval.box import Interval
 _MAX_STATES, _MAX_VERTICES = 12, 2**16
 
 
+@named_arguments
 def affine_abstraction(
     f: Callable[[Any], Any],
     region: Interval,

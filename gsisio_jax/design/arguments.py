@@ -92,7 +92,8 @@ def checked(
     if u_region is None:
         if system.takes_u:
             raise ValueError(
-                "design_observer: f or g takes u; give `u_region`, the box of known inputs for which the design holds"
+                "design_observer: f or g takes u; give `u_region` ([u_region] in a file), the box of known inputs for "
+                "which the design holds"
             )
         u_region = Interval(np.zeros(system.m), np.zeros(system.m))
     check_type("design_observer", "u_region", u_region, Interval, f"gx.Interval(lower, upper) of shape ({system.m},)")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal, overload
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax._collector import rare_collection
 from gsisio_jax.design.arguments import check_cells, checked
 from gsisio_jax.design.current import Dials, design_current
@@ -106,6 +107,7 @@ def design_observer(
 ) -> PredictionObserver: ...
 
 
+@named_arguments
 def design_observer(
     system: System,
     noise: Noise,

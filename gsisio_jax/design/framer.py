@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.certificate import spectral_radius
 from gsisio_jax.plant.system import System
@@ -62,6 +63,7 @@ class FramerGains(NamedTuple):
     guaranteed: bool
 
 
+@named_arguments
 def framer_gains(system: System, left_inverse: Any = None) -> FramerGains:
     """The gains of Theorem 1.
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.gain_selection import profile_of
@@ -31,6 +32,7 @@ from gsisio_jax.observer.window import by_state
 from gsisio_jax.plant.system import Noise
 
 
+@named_arguments
 def mean_input(
     observer: Observer, estimate: Estimate, y: Any, u: Any = None, noise: Noise | None = None, *, steps: int
 ) -> Interval:

@@ -14,6 +14,7 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.examples.example import Example, Record
 
 __all__ = ["Example", "Record", "config_path", "load", "names", "teaches"]
@@ -49,6 +50,7 @@ def teaches() -> dict[str, str]:
     return {name: load(name).teaches for name in names()}
 
 
+@named_arguments
 def load(name: str) -> Example:
     """A built-in example.
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.files.container import read, restore, write
 from gsisio_jax.files.once import once_per_observer
 from gsisio_jax.files.systems import described, differing_maps
@@ -23,6 +24,7 @@ from gsisio_jax.observer.types import Carry
 _OBSERVER = "it is what gx.design_observer or gx.load_observer returns"
 
 
+@named_arguments
 def save_carry(path: str | os.PathLike[str], carry: Carry, observer: AnyObserver, step: int = 0) -> None:
     """Write where an online run stands; `load_carry` reads it. The file is there whole or not at all.
 
@@ -48,6 +50,7 @@ def save_carry(path: str | os.PathLike[str], carry: Carry, observer: AnyObserver
     write(call, path, "carry", about, carry)
 
 
+@named_arguments
 def load_carry(path: str | os.PathLike[str], observer: AnyObserver) -> tuple[Carry, int]:
     """A carry that `save_carry` has written: `step` goes on from it in the same bits.
 

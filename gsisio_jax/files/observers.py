@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.files.container import read, restore, write
 from gsisio_jax.files.systems import Compare, check_system, described
 from gsisio_jax.interval.box import is_concrete
@@ -24,6 +25,7 @@ def save_observer(path: str | os.PathLike[str], observer: Any) -> None:
     write("Observer.save", path, "observer", described(observer), observer)
 
 
+@named_arguments
 def load_observer(path: str | os.PathLike[str], system: System, compare: Compare = "program") -> Any:
     """An observer that `Observer.save` has written. Its boxes are those of the observer that was saved, bit for bit.
 
@@ -41,7 +43,7 @@ def load_observer(path: str | os.PathLike[str], system: System, compare: Compare
             same to rounding.
 
     Returns:
-        `Observer`, `DelayedObserver` or `PredictionObserver`, in the floating type of the one that was saved: what was
+        Observer | DelayedObserver | PredictionObserver: in the floating type of the one that was saved. What was
         designed in float64 stays so also where ``jax_enable_x64`` is off, and is brought to float32 with the data.
 
     Raises:

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import is_whole
 from gsisio_jax.interval.rounding import outward
@@ -18,6 +19,7 @@ CHUNK = 256
 """Boxes at a time: all numbers of one chunk stay in the first cache, where those of 10^4 boxes stay in none."""
 
 
+@named_arguments
 def batched(bounds: Callable[..., Any], shared: bool = True, chunk: int = CHUNK) -> Callable[..., Any]:
     """Bounds on many boxes at once, compiled: as ``jax.vmap(bounds)``, up to the last digits, and faster.
 

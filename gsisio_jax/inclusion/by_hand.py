@@ -8,6 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.inclusion.node import Node, as_node, chain, is_node, join
 from gsisio_jax.interval.box import Interval
 
@@ -21,6 +22,7 @@ class _ByHand:
 BY_HAND: dict[str, _ByHand] = {}
 
 
+@named_arguments
 def register_bounds(name: str, natural: Callable[..., Interval], derivative: Callable[..., Any] | None = None) -> None:
     """Supply bounds by hand for a primitive, or for a function of your own under ``jax.jit``.
 

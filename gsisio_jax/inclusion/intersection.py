@@ -11,6 +11,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.inclusion.mixed_monotone import decomposition, remainder
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.inclusion.transforms import AffineForm, affine, distance, jacobian, mean_value, natural
@@ -37,6 +38,7 @@ def check_methods(call: str, methods: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in METHODS if name in given)
 
 
+@named_arguments
 def bound(
     f: Callable[..., Any],
     methods: Sequence[str] = DEFAULT,
@@ -56,7 +58,7 @@ def bound(
         rounding: as in `natural`.
 
     Returns:
-        A function that returns an `AffineForm`: its range is the intersection of all ranges; its slope is that of the
+        Callable: it returns an `AffineForm`. Its range is the intersection of all ranges; its slope is that of the
         affine form, else of the mean-value form, else zero.
 
     Raises:

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.inclusion.pointwise import Rows, check_derivative, room
 from gsisio_jax.inclusion.transforms import AffineForm, affine
 from gsisio_jax.interval.box import Interval
@@ -37,6 +38,7 @@ MAX_CORNER_DIMENSION = 10
 """`remainder` evaluates f at 2^n corners: n may not be larger than this."""
 
 
+@named_arguments
 def decomposition_gain(derivative: Interval) -> Any:
     """The matrix C of ``f_d(x, y) = f(z) + C (x - y)``, from bounds (a, b) of the derivative, entry by entry.
 
@@ -55,6 +57,7 @@ def decomposition_gain(derivative: Interval) -> Any:
     return jnp.where((a >= 0) | (b <= 0), 0, jnp.where(-a <= b, -a, b))
 
 
+@named_arguments
 def width_gain(derivative: Interval) -> Any:
     """How much wider than the box the bounds of the decomposition function are, entry by entry.
 
@@ -75,6 +78,7 @@ def width_gain(derivative: Interval) -> Any:
     return jnp.maximum(jnp.abs(a), jnp.abs(b)) + 2 * decomposition_gain(derivative)
 
 
+@named_arguments
 def decomposition_function(
     f: Callable[..., Any], derivative: Any, form: Literal["cases", "optimal"] = "cases"
 ) -> Callable[..., Any]:
@@ -128,6 +132,7 @@ def decomposition_function(
     return f_d
 
 
+@named_arguments
 def decomposition(
     f: Callable[..., Any], derivative: Any = None, rounding: Rounding | None = None
 ) -> Callable[..., Any]:
@@ -168,6 +173,7 @@ def decomposition(
     return bounds
 
 
+@named_arguments
 def remainder(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | None = None) -> Callable[..., Any]:
     """Bounds of f by the remainder form, the best of all 2^n choices for every row.
 
@@ -205,6 +211,7 @@ def remainder(f: Callable[..., Any], derivative: Any = None, rounding: Rounding 
     return bounds
 
 
+@named_arguments
 def tight(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | None = None) -> Callable[..., Any]:
     """The tightest bounds of f that this package has: exact where the signs of the derivative are known.
 

@@ -60,7 +60,7 @@ class Abstraction(eqx.Module):
             box: shape (n,), units [x].
 
         Returns:
-            Box of shape (m,), units [f]: over each cell that the box touches, the planes' range on the common part;
+            Interval: (m,), units [f]. Over each cell that the box touches, the planes' range on the common part;
             of these the hull. ``(-inf, inf)`` if any part of the box lies outside the region.
 
         Raises:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.inclusion.form_arithmetic import box_sum, guard, is_known, is_point, product, slope_image, sum_slack
 from gsisio_jax.inclusion.interpreter import evaluate
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node, is_node, jac_of, slack_of, slope_of
@@ -48,6 +49,7 @@ class AffineForm(eqx.Module):
         return guard(box_sum(slope_image(slope, box.astype(slope.dtype)), self.offset))
 
 
+@named_arguments
 def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Natural inclusion function of f: every operation replaced by its range.
 
@@ -84,6 +86,7 @@ def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable
     return bounds
 
 
+@named_arguments
 def affine(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Affine bounds of f: a function of a box (n,) and of f's further arguments that returns an `AffineForm`.
 
@@ -105,6 +108,7 @@ def affine(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[
     return bounds
 
 
+@named_arguments
 def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Enclosure of the Jacobian of f: a function of a box (n,) and of f's further arguments.
 
@@ -127,6 +131,7 @@ def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callabl
     return bounds
 
 
+@named_arguments
 def mean_value(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[..., Any]:
     """Mean-value form ``f(c) + J (box - c)`` around the center c of the box; arguments and errors as `natural`.
 

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.cast import cast_down, cast_towards, cast_up
 from gsisio_jax.interval.minmax import cut, larger, raised, smaller
@@ -52,6 +53,7 @@ class Interval(eqx.Module):
     lower: Any
     upper: Any
 
+    @named_arguments
     def __init__(self, lower: Any, upper: Any):
         lower = read_array("Interval", "lower", lower)
         upper = read_array("Interval", "upper", upper)
@@ -143,6 +145,12 @@ class Interval(eqx.Module):
 
     def __contains__(self, value: Any) -> bool:
         raise TypeError("Interval: `x in box` would not say of which components; use box.contains(x), then .all()")
+
+    def __bool__(self) -> bool:
+        raise TypeError(
+            "Interval: a box is neither true nor false; ask for `box is None`, box.contains(x).all() or "
+            "(box.width < limit).all()"
+        )
 
     def _no_arithmetic(self, *_: Any) -> Any:
         raise TypeError(
@@ -309,12 +317,14 @@ def _check_pair(call: str, a: Any, b: Any) -> None:
         raise ValueError(f"{call}: two boxes of the same shape are needed, got {a.shape} and {b.shape}") from None
 
 
+@named_arguments
 def hull(a: Interval, b: Interval) -> Interval:
     """The smallest box that contains both boxes, elementwise."""
     _check_pair("hull", a, b)
     return Interval.unchecked(smaller(a.lower, b.lower), larger(a.upper, b.upper))
 
 
+@named_arguments
 def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
     """Elementwise intersection and its signed slack.
 
@@ -323,8 +333,8 @@ def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
         b: a box of the same shape.
 
     Returns:
-        The intersection, and the slack ``min(a.upper - b.lower, b.upper - a.lower)``: how far one box could be moved
-        before they miss each other. A negative slack is the size of the gap; there the first box is returned
+        (Interval, slack): the intersection, and ``min(a.upper - b.lower, b.upper - a.lower)``, how far one box could be
+        moved before they miss each other. A negative slack is the size of the gap; there the first box is returned
         unchanged, so the result is never crossed: the caller must look at the slack. A side of b that is NaN (it
         overflowed) is passed over.
     """

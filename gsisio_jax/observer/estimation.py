@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.interval.rounding import Rounding
@@ -102,6 +103,7 @@ class Estimate(eqx.Module):
         return self.to_xarray(**labels).to_dataframe()
 
 
+@named_arguments
 def estimate(
     observer: AnyObserver,
     initial: Interval,
@@ -146,6 +148,7 @@ def estimate(
     return _estimate(*fixed(observer), initial, y, u, noise, check_on_conflict("estimate", on_conflict))
 
 
+@named_arguments
 def start(
     observer: AnyObserver,
     initial: Interval,
@@ -175,6 +178,7 @@ def start(
     return _start(*fixed(observer), initial, y0, u0, noise, check_on_conflict("start", on_conflict))
 
 
+@named_arguments
 def step(
     observer: AnyObserver,
     carry: Carry,
@@ -206,6 +210,7 @@ def step(
     return _step(*fixed(observer), _as(carry, box.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))
 
 
+@named_arguments
 def resume(
     observer: AnyObserver,
     carry: Carry,
@@ -230,6 +235,7 @@ def _as(carry: Carry, dtype: Any) -> Carry:
     return carry if carry.state.lower.dtype == dtype else cast(carry, dtype)
 
 
+@named_arguments
 def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
     """Join the outputs of `start`, `step` and `resume`, in order, into the `Estimate` of the whole record.
 

@@ -68,6 +68,11 @@ class PredictionObserver(eqx.Module):
     rounding: Rounding = eqx.field(static=True, default="outward")
 
     @property
+    def delay(self) -> int:
+        """0: boxes of x[k] come with y[k]; a `DelayedObserver` has another."""
+        return 0
+
+    @property
     def guaranteed(self) -> bool:
         """False: what J [G; H] leaves of the identity by rounding is not bounded in this form, and d has no bound."""
         return False

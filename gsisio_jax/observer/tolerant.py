@@ -45,6 +45,11 @@ class TolerantObserver(Wrapped):
     tolerate: int = eqx.field(static=True)
 
     @property
+    def delay(self) -> int:
+        """0: boxes of x[k] come with y[k]."""
+        return 0
+
+    @property
     def system(self) -> System:
         """The plant."""
         return self.inner.system

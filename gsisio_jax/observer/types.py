@@ -168,6 +168,11 @@ class Observer(eqx.Module):
     rounding: Rounding = eqx.field(static=True, default="outward")
 
     @property
+    def delay(self) -> int:
+        """0: boxes of x[k] come with y[k]; a `DelayedObserver` has another."""
+        return 0
+
+    @property
     def guaranteed(self) -> bool:
         """The boxes hold on the machine."""
         return self.rounding == "outward"

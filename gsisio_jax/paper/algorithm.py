@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.design.build import design_observer
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse
 from gsisio_jax.interval.box import Interval
@@ -39,6 +40,7 @@ class Gsisio(NamedTuple):
     input_width_bound: np.ndarray
 
 
+@named_arguments
 def gsisio(
     f: Callable[..., Any],
     g: Callable[..., Any],

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import inclusion
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.inclusion.mixed_monotone import decomposition_gain, width_gain
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
@@ -105,6 +106,7 @@ PRINTED = PrintedNumbers(
 )
 
 
+@named_arguments
 def lipschitz_constants(
     system: System,
     region: Interval,

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.design.framer import framer_gains
 from gsisio_jax.design.lmi import LmiAnswer, iss_lmi, printed_lmi
 from gsisio_jax.interval.box import Interval
@@ -160,6 +161,7 @@ def block_matrix(T_f: np.ndarray, T_g: np.ndarray, Q: float) -> np.ndarray:
     )
 
 
+@named_arguments
 def stability(
     system: System,
     noise: Noise,

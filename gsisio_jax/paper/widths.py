@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.paper.lipschitz import spectral_norm
 from gsisio_jax.paper.stability import Stability
@@ -46,6 +47,7 @@ class WidthBounds(NamedTuple):
     input_elementwise_limit: np.ndarray
 
 
+@named_arguments
 def width_bounds(stability: Stability, initial_width: Any, steps: int, printed: bool = False) -> WidthBounds:
     """Upper bounds of the widths of the paper's recursion with decomposition bounds.
 
@@ -59,7 +61,7 @@ def width_bounds(stability: Stability, initial_width: Any, steps: int, printed: 
         printed: Lemma 5's own formulas exactly as printed.
 
     Returns:
-        `WidthBounds`. For L >= 1 the sequences are finite (L = 1: ``k ||dz||`` is added) and the limits infinite.
+        WidthBounds: for L >= 1 the sequences are finite (``k ||dz||`` is added where L = 1) and the limits infinite.
 
     Raises:
         ValueError: the width has the wrong shape or is negative or not finite, or `steps` is negative.

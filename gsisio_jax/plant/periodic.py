@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type, is_whole, read_array
@@ -157,6 +158,7 @@ def columns(periods: Periods, size: int) -> np.ndarray:
     return period
 
 
+@named_arguments
 def wrapped(system: Any, boxes: Any) -> Interval:
     """State boxes for display: those of periodic states moved by multiples of the period, so that their centers lie
     between minus and plus half a period. Boxes are not cut: one that holds pi reaches beyond it.
@@ -209,6 +211,7 @@ def moved_by(boxes: Interval, count: Any, period: np.ndarray) -> Interval:
     )
 
 
+@named_arguments
 def nearest(system: Any, x: Any, boxes: Interval) -> Any:
     """The states x (..., n) with periodic ones moved by multiples of the period, as near as possible to the middle of
     the box: what to compare a box with, which holds of a periodic state up to such a multiple.

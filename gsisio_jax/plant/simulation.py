@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type, is_whole, read_array
 from gsisio_jax.plant.periodic import wrapped_outputs
@@ -25,8 +26,12 @@ class Simulation(NamedTuple):
     v: Float[Array, "steps l"]
 
 
+@named_arguments
 def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = None) -> Simulation:
     """Simulate the plant with noise drawn uniformly from its bounds.
+
+    ``state_bounds`` and ``input_bounds`` of the system are not enforced. A record that leaves them is not one of this
+    system, and boxes need not hold it.
 
     Args:
         system: the plant.

@@ -13,6 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.plant.calls import as_static, as_vector, check_map, hashable, takes_u
@@ -76,6 +77,7 @@ class System(eqx.Module):
     input_rate: Interval | None
     input_constant: int | None = eqx.field(static=True)
 
+    @named_arguments
     def __init__(
         self,
         f: Callable[..., Any],
@@ -191,6 +193,7 @@ class Noise(eqx.Module):
     w: Interval
     v: Interval
 
+    @named_arguments
     def __init__(self, w: Interval, v: Interval):
         for name, box in (("w", w), ("v", v)):
             check_type("Noise", name, box, Interval, "gx.Interval.symmetric(r) is the box from -r to r")
@@ -224,7 +227,10 @@ def _matrix(name: str, value: Any, shape: tuple[int, int] | None = None) -> np.n
             f"System: `{name}` is traced by JAX, and must be known; make the System outside of jit, vmap and grad"
         ) from error
     if matrix.ndim != 2:
-        raise ValueError(f"System: {name} must be a matrix (2 dimensions), got shape {matrix.shape}")
+        raise ValueError(
+            f"System: {name} must be a matrix (2 dimensions), got shape {matrix.shape}; "
+            "one column is written [[a], [b]], a row for each state (G, B) or output (H, D)"
+        )
     if shape is not None and matrix.shape != shape:
         raise ValueError(f"System: {name} must have shape {shape}, got {matrix.shape}")
     if not np.isfinite(matrix).all():

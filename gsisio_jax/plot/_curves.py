@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.plot import style
 from gsisio_jax.plot.scales import Merge, Scale, merge_of, quantiles
 from gsisio_jax.plot.study import BESIDE, Quantity, axes_of, conflicts_of, prepared, quantities, title_of, with_entry
@@ -14,6 +15,7 @@ from gsisio_jax.plot.study import BESIDE, Quantity, axes_of, conflicts_of, prepa
 SINGLE = 5  # most cases that are drawn one by one
 
 
+@named_arguments
 def curves(
     dataset: Any,
     variable: str | None = None,

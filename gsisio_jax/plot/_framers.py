@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.reading import read_array
 from gsisio_jax.plot import style
 from gsisio_jax.plot.record import Record, Series, read_record
@@ -16,6 +17,7 @@ from gsisio_jax.plot.study import check_signals
 MANY = 50  # alarms
 
 
+@named_arguments
 def framers(
     dataset_or_estimate: Any,
     signals: Sequence[str] | None = None,
@@ -65,6 +67,7 @@ def framers(
     return style.handed_back(ax, axes)
 
 
+@named_arguments
 def save(
     dataset_or_estimate: Any,
     path: str | Path,
@@ -81,11 +84,13 @@ def save(
 
     Raises:
         MissingExtra: matplotlib is not installed.
+        ValueError: the ending is no format of matplotlib, or the folder is not there.
     """
     module = style.require("matplotlib.figure")
     record = read_record(dataset_or_estimate)
     if not isinstance(path, str | Path):
         raise ValueError(f"plot.save: `path` must be the name of a file, got {type(path).__name__}; say 'boxes.png'")
+    style.check_picture("plot.save: `path`", path)
     names = list(record.series) if signals is None else list(signals)
     figure = module.Figure(layout="constrained")
     axes = style.stacked(figure, len(names))

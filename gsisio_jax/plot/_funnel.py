@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.plot import style
 from gsisio_jax.plot._framers import true_rows
 from gsisio_jax.plot.scales import quantiles
@@ -15,6 +16,7 @@ from gsisio_jax.plot.tubes import Group, Tube, Tubes, read_tubes
 LINES = 20  # cases drawn one by one
 
 
+@named_arguments
 def funnel(
     dataset: Any, signal: str | Sequence[str] | None = None, ax: Any = None, truth: Mapping[str, Any] | None = None
 ) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.plot import style
 from gsisio_jax.plot.scales import Scale, merge_of
 from gsisio_jax.plot.study import Quantity, axes_of, conflicts_of, prepared, quantities, title_of
@@ -34,6 +35,7 @@ class Mesh:
     remark: str
 
 
+@named_arguments
 def heatmap(
     dataset: Any,
     variable: str | None = None,

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.plot import style
 
 LINES = ("-", "--", ":", "-.")
 
 
+@named_arguments
 def tightness(found: Any, ax: Any = None) -> Any:
     """Draw how much wider than the hull the boxes are: the ratio of widths of every state over the steps; 1 is as
     narrow as any observer can be.

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.plot import style
 from gsisio_jax.plot.scales import quantiles
 from gsisio_jax.plot.tubes import Group, Tube, Tubes, read_tubes
@@ -15,6 +16,7 @@ SHARES = (0.05, 0.5, 0.95, 1.0)
 LEVELS = 3
 
 
+@named_arguments
 def widths(
     dataset_or_estimate: Any, signals: str | Sequence[str] | None = None, certificate: Any = None, ax: Any = None
 ) -> Any:

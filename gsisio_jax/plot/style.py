@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,24 @@ def require(module: str = "matplotlib") -> Any:
         MissingExtra: it is not installed.
     """
     return need(module, extra="plot", purpose="drawing a picture")
+
+
+def check_picture(call: str, path: str | Path) -> None:
+    """A file that matplotlib can write, in a folder that is there: before anything is drawn.
+
+    Raises:
+        ValueError: the path has an ending that names no format, or the folder is missing.
+    """
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    path, known = Path(path), FigureCanvasBase.get_supported_filetypes()
+    if path.suffix[1:].lower() not in known:
+        raise ValueError(
+            f"{call} must end in the format of a picture (.{', .'.join(known)}), got '{path}'; "
+            f"say '{path.with_suffix('.png') if path.name else 'boxes.png'}'"
+        )
+    if not path.parent.is_dir():
+        raise ValueError(f"{call} must be in a folder that is there, got '{path}'; make '{path.parent}' first")
 
 
 def panels(call: str, count: int, ax: Any, arrange: Any) -> tuple[np.ndarray, Any]:

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
+
 RUN = "run"  # the axis of arguments that have a leading batch axis and no name
 TAKEN = ("state", "input", "time", "quantile")  # dimensions of the results themselves
 
@@ -40,6 +42,7 @@ class Axis:
     unit: str
 
 
+@named_arguments
 def grid(name: str, value: Any, coordinate: Any = None, unit: str = "") -> Axis:
     """Let an argument of `sweep` vary along a named axis.
 

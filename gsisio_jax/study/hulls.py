@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.checks import AnyObserver, prepare, refuse_input_model
 from gsisio_jax.observer.delayed import DelayedObserver
@@ -23,6 +24,7 @@ from gsisio_jax.study.tightness_result import Tightness
 STEPS = 10
 
 
+@named_arguments
 def tightness(
     observer: AnyObserver,
     initial: Interval,

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
 from gsisio_jax.errors import ContainmentLost
 from gsisio_jax.interval.box import Interval
@@ -41,6 +42,7 @@ RANKS = {
 Draw = Literal["uniform", "vertices"] | Callable[..., Any]
 
 
+@named_arguments
 def monte_carlo(
     observer: AnyObserver,
     key: Any,

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.observer.status import Status
 from gsisio_jax.observer.types import StepOutput
 from gsisio_jax.study.reduction_base import Context, Kept, Reduction, Variable
@@ -218,6 +219,7 @@ class Boxes(Kept):
         return {**bounds, "status": Variable(("time",), "status of the step (0 = OK)", "status")}
 
 
+@named_arguments
 def quantiles(*probabilities: float) -> Quantiles:
     """Quantiles over time of the widths, exact (linear between the sorted widths).
 
@@ -238,6 +240,7 @@ def quantiles(*probabilities: float) -> Quantiles:
     return Quantiles(tuple(float(q) for q in probabilities))
 
 
+@named_arguments
 def settle(factor: float = 2.0) -> Settle:
     """First step from which on all state widths are at most `factor` times the certificate's steady width.
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
 
 # What is told elsewhere, or has no sense as a mean.
@@ -13,6 +14,7 @@ PLAIN = ("coverage", "miss", "broken_at")
 STATISTICS = ("mean", "mean_lower", "mean_upper", "std", "min", "median", "max", "share")
 
 
+@named_arguments
 def summary(dataset: Any, dim: str = "run", confidence: float = 0.95) -> Any:
     """Add the statistics of every floating variable over an axis.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.rounding import Rounding
@@ -24,6 +25,7 @@ from gsisio_jax.study.run import run
 CALL = "sweep"
 
 
+@named_arguments
 def sweep(
     observer: AnyObserver,
     initial: Interval | Axis,

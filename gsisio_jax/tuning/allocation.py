@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.build import design_observer
@@ -70,6 +71,7 @@ class Allocation:
         )
 
 
+@named_arguments
 def allocate(
     system: System,
     noise: Noise,

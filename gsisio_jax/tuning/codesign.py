@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import inclusion
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.gain_selection import main_gain, units
 from gsisio_jax.design.gains import solve
@@ -60,6 +61,7 @@ class Optimum(NamedTuple):
     inverse: Any
 
 
+@named_arguments
 def optimal_widths(plant: Plant, theta: Any, u_region: Interval | None = None) -> Any:
     """Steady widths of the certificate with the gain re-optimised at `theta`, (n,); differentiable in `theta`.
 

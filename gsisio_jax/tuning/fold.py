@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax import scalar
+from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import checks, scan
 from gsisio_jax.observer.checks import AnyObserver
@@ -24,6 +25,7 @@ from gsisio_jax.plant.system import Noise
 SHORT = 512  # steps up to which a record is one chunk
 
 
+@named_arguments
 def fold(
     observer: AnyObserver,
     initial: Interval,

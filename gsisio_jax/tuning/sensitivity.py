@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import checks
@@ -22,6 +23,7 @@ from gsisio_jax.tuning.model import with_model
 KINDS = ("final", "steady", "certificate")
 
 
+@named_arguments
 def width_sensitivity(
     observer: Observer,
     initial: Interval,

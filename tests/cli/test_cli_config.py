@@ -63,6 +63,8 @@ CASES = {
     "u not there": ('y = ["pos"', 'u = ["pos"]\ny = ["pos"', ["table.u has 1 column, the system has no known inputs"]),
     "u region": ("[initial]", "[u_region]\nradius = [1.0]\n[initial]", ["u_region is given", "no known inputs"]),
     "file name": ('"boxes.csv"', '"../boxes.csv"', ["outputs.csv: must be a plain file name"]),
+    "picture of no kind": ('"cart.png"', '"a.foo"', ["outputs.picture must end in", "say 'a.png'"]),
+    "picture unnamed": ('"cart.png"', '"a"', ["outputs.picture must end in", ".pdf", "got 'a'"]),
     "same file": ('"boxes.csv"', '"cart.nc"', ["outputs: netcdf, csv, picture and report must be different files"]),
     "syntax": ("[noise]", "[noise", ["cart.toml: not valid TOML", "line 8"]),
     "conflict rule": ("[outputs]", "[estimate]\non_conflict = 'stop'\n[outputs]", ["estimate.on_conflict", "'stop'"]),

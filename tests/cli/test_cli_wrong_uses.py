@@ -45,6 +45,8 @@ WORDS = {
     "misspelt option": (("estimate", "cart.toml", "--outt", "x"), "--outt"),
     "no configuration": (("estimate",), "required: CONFIG"),
     "three files": (("estimate", "cart.toml", "cart.csv", "b.csv"), "b.csv"),
+    "no folder": (("estimate", "cart.toml", "--out", ""), 'argument --out: must be the name of a folder, got ""'),
+    "init into none": (("init", "cart.csv", "--out="), 'got ""; the one at hand is "."'),
     "reproduce with a folder": (("reproduce", "nothing"), "unrecognized arguments: nothing"),
 }
 

@@ -115,6 +115,18 @@ def test_the_plant_moves_on_within_a_step(method, order):
     assert at_start < left_out <= model.error.upper[0] < 2 * left_out
 
 
+def test_a_pole_that_a_short_step_cannot_reach_is_no_obstacle():
+    """``x' = -1/(2 + x)`` is solved exactly; a tenth of the region below 0 lies its pole."""
+    h, wide = 0.02, Interval([0.0], [20.0])
+    model = gx.discretize(lambda x: -1 / (2 + x), h, region=wide)
+    x = np.linspace(0, 20, 401)[:, None]
+    found = np.sqrt((2 + x) ** 2 - 2 * h) - 2 - np.asarray(jax.vmap(model.f)(x))
+    assert np.asarray(model.error.contains(found)).all()
+    assert model.error.width[0] < 1e-5
+    with pytest.raises(ValueError, match=r"no finite bound; give .* a shorter dt"):
+        gx.discretize(lambda x: -1 / (2 + x), 2.5, region=wide)
+
+
 def test_kinks_are_bounded_on_both_sides():
     """``-|x|`` grows at a rate of 1 on one side and falls on the other: of Euler's error both signs occur."""
     model = gx.discretize(lambda x: -jnp.abs(x), 0.1, "euler", region=Interval([-1.0], [1.0]))

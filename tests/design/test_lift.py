@@ -114,7 +114,9 @@ def test_an_error_says_which_delay_would_do():
     for delay in (0, 1, "auto"):
         with pytest.raises(gx.ObserverDoesNotExist, match="no observer exists, with no delay up to n = 3 steps"):
             seen(NEVER, FIRST, LAST, delay=delay)
-    assert isinstance(seen(CHAIN, FIRST, [[1.0], [0], [0]], delay="auto"), gx.Observer)
+    at_once = seen(CHAIN, FIRST, [[1.0], [0], [0]], delay="auto")
+    assert isinstance(at_once, gx.Observer)
+    assert at_once.delay == 0
 
 
 def test_an_output_that_is_not_affine_is_no_proof():

@@ -18,6 +18,14 @@ FILES = {
     "carry swapped": (lambda o: gx.save_carry("c", o.observer, o.carry), "save_carry: `carry`", "got Observer"),
     "carry before": (lambda o: gx.save_carry("c", o.carry, o.observer, -1), "save_carry: `step`", "at least 0", "-1"),
     "picture nowhere": (lambda o: gx.plot.save(o.boxes, 3), "plot.save: `path`", "name of a file", "int"),
+    "picture of no kind": (lambda o: gx.plot.save(o.boxes, "a.foo"), "plot.save: `path`", ".png", "'a.foo'", "'a.png'"),
+    "picture unnamed": (lambda o: gx.plot.save(o.boxes, "boxes"), "plot.save: `path`", "'boxes'", "say 'boxes.png'"),
+    "picture in no folder": (
+        lambda o: gx.plot.save(o.boxes, "no/a.png"),
+        "plot.save: `path`",
+        "'no/a.png'",
+        "make 'no'",
+    ),
     "a word for names": (lambda o: o.boxes.to_xarray(state_names="ab"), "`state_names`", "a list of 2", "'ab'"),
     "too few names": (lambda o: o.boxes.to_xarray(state_names=["a"]), "`state_names` has 1", "has 2"),
     "one name twice": (lambda o: o.boxes.to_pandas(state_names=["a", "a"]), "to_dataset", "'a'", "of its own"),
@@ -92,7 +100,7 @@ CALLS = {
         "got 0",
     ),
     "u of no size": (plant(f_of_u), "System: f or g takes u", "m=..."),
-    "G a column": (plant(G=[1.0, 0.0], H=[0.0]), "System: G must be a matrix", "(2,)"),
+    "G a column": (plant(G=[1.0, 0.0], H=[0.0]), "System: G must be a matrix", "(2,)", "[[a], [b]]"),
     "G and H": (plant(G=[[1.0], [0]], H=[[0.0, 1.0]]), "System: G has shape (2, 1)", "one column per unknown input"),
     "G for H": (plant(G=[[0.0]], H=[[1.0], [0.0]]), "System: ", "rows of"),
 }

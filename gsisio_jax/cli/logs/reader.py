@@ -14,6 +14,7 @@ from .dialect import Dialect
 from .stamps import StampReader, Stamps
 
 TOLERANCE = 0.1  # of the sample time
+KNOWN = "every step needs one: fill it in with a table.transform, or make it an unknown input, a column of G"
 
 
 @dataclass(frozen=True)
@@ -219,14 +220,14 @@ class TableReader:
             row, column = np.unravel_index(int(np.argmax(blank)), blank.shape)
             raise UserError(
                 f"{self.name}: row {found['rows'][row]}, column '{self.part.u[column]}': a known input is missing; "
-                "every step needs one"
+                + KNOWN
             )
         absent = np.diff(found["index"], prepend=self._last) - 1
         if (absent > 0).any():
             bad = int(np.argmax(absent > 0))
             raise UserError(
                 f"{self.name}: row {found['rows'][bad]}: {absent[bad]} rows of the grid are absent before it, so "
-                f"the known inputs ({', '.join(self.part.u)}) are not known there; every step needs them"
+                f"the known inputs ({', '.join(self.part.u)}) are not known there, and {KNOWN}"
             )
 
 
