@@ -169,7 +169,7 @@ def design_current(
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
-    observer = replace(observer, input_rows=rows_of_inputs(problem, system, dials.window, width))
+    observer = replace(observer, input_rows=rows_of_inputs(problem, system, dials.window, width, bank, observer.window))
     if maps is not None:
         rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
         observer = replace(observer, recovery=rows_alone)

@@ -126,8 +126,8 @@ def _means(
     system = observer.system
     moves = typed(Interval.entire(system.p) if system.input_rate is None else system.input_rate, y.dtype)
 
-    def of_window(x: Interval, pasts: Any, inputs: Any) -> Interval:
-        found = from_rows(maps, rows, x, pasts, inputs, [moves] * rows.length)
+    def of_window(steps: Any, inputs: Any) -> Interval:
+        found = from_rows(maps, rows, steps, inputs, [moves] * (rows.length + 1))
         return by_state(found, rows.targets, system.p)
 
     def at(tree: Any, lag: int) -> Any:
@@ -135,9 +135,9 @@ def _means(
         return jax.tree.map(lambda leaf: leaf[first : first + count], tree)
 
     every = Past(y, u, noise, ~conflict, jnp.ones_like(conflict), state, h)
-    pasts = [at(every, lag) for lag in range(rows.length)]
+    now, *pasts = [at(every, lag) for lag in range(-1, rows.length)]
     pasts = [Past(p.y, p.u, p.noise, p.believed, p.trusted & ~broken, p.state, p.h) for p in pasts]
-    found = jax.vmap(of_window)(at(state, -1), pasts, [at(d, lag) for lag in range(rows.length)])
+    found = jax.vmap(of_window)([now, *pasts], [at(d, lag) for lag in range(rows.length)])
     # Sides that are NaN (they overflowed) say nothing.
     low = rounding.down(jnp.nan_to_num(found.lower / steps, nan=-jnp.inf, posinf=jnp.inf, neginf=-jnp.inf).max(-2))
     high = rounding.up(jnp.nan_to_num(found.upper / steps, nan=jnp.inf, posinf=jnp.inf, neginf=-jnp.inf).min(-2))

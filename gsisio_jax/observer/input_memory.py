@@ -16,38 +16,44 @@ import numpy as np
 
 from gsisio_jax.inclusion.atoms import wider
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.box import Interval, add, choose, entire_like, magnitude
+from gsisio_jax.interval.box import Interval, add, choose, entire_like, is_concrete, magnitude
 from gsisio_jax.interval.image import loose_matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.observer import past
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.lost import plainly_wider
-from gsisio_jax.observer.measurement import everything_unless, shift_box, typed
+from gsisio_jax.observer.measurement import everything_unless, output_box, shift_box, typed
 from gsisio_jax.observer.status import Source
 from gsisio_jax.observer.window import added, by_state
+from gsisio_jax.plant.system import Noise
 
 
 class InputRows(eqx.Module):
     """R rows for single inputs over the last N steps; lag t stands for step k-1-t.
 
         sum of d_j[k-1-t] over t < over =
-            now x[k] - sum over t of {multipliers [f + B u + w; g + D u + v - y] - (those of x) x}[k-1-t]
+            now x[k] - output (g + D u + v - y)[k] - ahead (d[k] - d[k-1])
+            - sum over t of {multipliers [f + B u + w; g + D u + v - y] - (those of x) x}[k-1-t]
             - sum over t of boxes d[k-1-t] - sum over t of moves (d[k-1-t] - d[k-2-t])
 
     What multiplies x[k-1-t] is the part of lag t+1 that acts on f, and `now` is that of lag 0.
 
     Attributes:
         multipliers: (N, R, n + l).
+        output, ahead: (R, l) and (R, p), what the rows use of y[k], where d[k] shows in it.
         boxes, moves: (N, R, p).
-        left: (N, R, p), what the rows leave of the inputs by rounding.
+        left: (N, R, p), what the rows leave of the inputs by rounding; left_now: (R, p), of d[k].
         targets: the input j of every row.
         counts: how many rows, the first ones, look back to lag 0, 1, ...
         over: 1 for d[k-1] itself.
     """
 
     multipliers: Any
+    output: Any
+    ahead: Any
     boxes: Any
     moves: Any
     left: Any
+    left_now: Any
     targets: tuple[int, ...] = eqx.field(static=True)
     counts: tuple[int, ...] = eqx.field(static=True)
     over: int = eqx.field(static=True, default=1)
@@ -60,7 +66,12 @@ class InputRows(eqx.Module):
     @property
     def terms(self) -> int:
         """What is added up of all lags, for rounding."""
-        return self.length * (2 + 2 * self.boxes.shape[-1]) + self.multipliers.shape[-1] + 4
+        return (self.length + 1) * (2 + 2 * self.boxes.shape[-1]) + self.multipliers.shape[-1] + 4
+
+    @property
+    def looks_ahead(self) -> bool:
+        """Some row uses y[k] by itself, beyond what the box of x[k] says."""
+        return not is_concrete(self.output) or bool(np.any(self.output))
 
 
 class InputMemory(eqx.Module):
@@ -108,8 +119,10 @@ def after(observer: Any, carry: Any, d: Interval, conflict: Any, hold: bool) -> 
 
 
 @jax.named_scope("input memory")
-def contract(maps: Any, domain: Domain, carry: Any, d: Interval) -> tuple[Interval, Domain]:
-    """Contract the box of d[k-1] with the memory and with every row, given the box of x[k]."""
+def contract(
+    maps: Any, domain: Domain, carry: Any, d: Interval, y: Any, u: Any, noise: Noise
+) -> tuple[Interval, Domain]:
+    """Contract the box of d[k-1] with the memory and with every row, given the box of x[k] and what was measured."""
     memory: InputMemory | None = carry.memory
     if memory is None:
         return d, domain
@@ -120,26 +133,30 @@ def contract(maps: Any, domain: Domain, carry: Any, d: Interval) -> tuple[Interv
     rows = maps.observer.input_rows
     pasts = (past.last(carry, None), *carry.older[: rows.length - 1])
     inputs = [d, *(memory.boxes[t] for t in range(rows.length - 1))]
-    moves = [_moves(maps.observer, memory, lag, d.dtype) for lag in range(rows.length)]
-    found = by_state(from_rows(maps, rows, domain.box, pasts, inputs, moves), rows.targets, d.shape[0])
+    moves = [_moves(maps.observer, memory, lag, d.dtype) for lag in range(-1, rows.length)]
+    yes, h = jnp.asarray(True), None
+    if rows.looks_ahead:
+        h = maps.output_bounds(maps.states(domain.box), domain.box, u)
+    now = past.Past(y, u, noise, yes, yes, domain.box, h)
+    found = by_state(from_rows(maps, rows, (now, *pasts), inputs, moves), rows.targets, d.shape[0])
     met = Domain.of(d, 0.0).intersect(found, Source.INPUT)
     return met.box, domain.taken(met)
 
 
-def from_rows(maps: Any, rows: InputRows, x: Interval, pasts: Any, inputs: Any, moves: Any) -> Interval:
+def from_rows(maps: Any, rows: InputRows, steps: Any, inputs: Any, moves: Any) -> Interval:
     """Boxes (R,) from every row.
 
     Args:
         maps: of the observer.
         rows: to be evaluated.
-        x: box of x[k].
-        pasts, inputs, moves: of lag 0, 1, ...: the step, the box of d[k-1-t], and that of d[k-1-t] - d[k-2-t].
+        steps: step k, whose h need bound g alone, and those of lag 0, 1, ...
+        inputs: boxes of d[k-1-t], t = 0, 1, ...
+        moves: boxes of d[k] - d[k-1], and of d[k-1-t] - d[k-2-t].
     """
-    system, dtype, terms, n = maps.observer.system, x.dtype, rows.terms, maps.observer.system.n
-    total = _negative(plain_image(rows.multipliers[0][:, :n], widened_for_sums(x, n + terms)))
+    (now, *pasts), (ahead, *moves) = steps, moves
+    system, terms, n = maps.observer.system, rows.terms, maps.observer.system.n
+    total, constants = _of_now(maps, rows, now, ahead, inputs[0])
     holds = jnp.ones(len(rows.targets), bool)
-    # Constants are widened for the sum of one row; here they go on through those of all lags.
-    constants: Any = jnp.zeros(len(rows.targets), dtype)
     for lag, (before, count) in enumerate(zip(pasts, rows.counts, strict=True)):
         multipliers = rows.multipliers[lag][:count]
         older = rows.multipliers[lag + 1][:count, :n] if lag + 1 < rows.length else np.zeros((count, n))
@@ -164,8 +181,29 @@ def from_rows(maps: Any, rows: InputRows, x: Interval, pasts: Any, inputs: Any, 
     return everything_unless(holds, Interval.unchecked(-(total.upper + loose), -(total.lower - loose)))
 
 
+def _of_now(maps: Any, rows: InputRows, now: Any, ahead: Interval, d: Interval) -> tuple[Interval, Any]:
+    """What rows take of step k, as they add it up, and the sizes of constants: these are widened for the sum of one
+    row, and go on through those of all lags."""
+    system, n = maps.observer.system, maps.observer.system.n
+    of_x = rows.multipliers[0][:, :n]
+    if not rows.looks_ahead:
+        none: Any = jnp.zeros(len(rows.targets), now.state.dtype)
+        return _negative(plain_image(of_x, widened_for_sums(now.state, n + rows.terms))), none
+    of_g = maps.rows(maps.on_outputs(rows.output), of_x)
+    found = of_g.joint_box(maps.states(now.state), now.h)
+    seen = output_box(system, now.y, now.u, now.noise.v)
+    known = [_negative(seen), ahead]
+    weights = jnp.concatenate([rows.output, rows.ahead], -1)
+    sides = (jnp.concatenate([getattr(box, side) for box in known]) for side in ("lower", "upper"))
+    part = plain_image(weights, widened_for_sums(Interval.unchecked(*sides), weights.shape[-1] + rows.terms))
+    if rounding.outward():
+        # |d[k]| is at most |d[k-1]| and the move; what has no bound of it is in no output that rows use.
+        part = plainly_wider(part, loose_matvec_upper(rows.left_now, magnitude(d) + magnitude(ahead)))
+    return Interval.unchecked(found.lower + part.lower, found.upper + part.upper), abs(of_g.constant)
+
+
 def _moves(observer: Any, memory: InputMemory, lag: int, dtype: Any) -> Interval:
-    """Box (p,) of d[k-1-lag] - d[k-2-lag]."""
+    """Box (p,) of d[k-1-lag] - d[k-2-lag]; lag -1: that of d[k] - d[k-1]."""
     system = observer.system
     zero = jnp.zeros(system.p, dtype)
     still = Interval.unchecked(zero, zero)

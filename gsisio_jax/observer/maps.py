@@ -103,6 +103,23 @@ class Maps:
         form = bound(self._free_map, observer.bounds, observer.output_abstraction)(box, u)
         return widened_atoms(form.slope, form.offset, form.range, states, self.terms)
 
+    def output_bounds(self, states: States, box: Interval, u: Any) -> AtomBounds:
+        """Atoms of [f; g] on a box, of which those that g does not need may be anything."""
+        system = self.observer.system
+        if self.expansion is not None:
+            of_g = self.expansion.rows(self.on_outputs(np.eye(system.l)), self.dtype)
+            return self.expansion.bounds(states, u, self.expansion.used_by(of_g))
+        form = bound(system.measurement, self.observer.bounds, None)(box, u)
+        zero = jnp.zeros(system.n, self.dtype)
+        slope, ranges = (
+            jnp.concatenate([jnp.zeros((system.n, system.n), self.dtype), form.slope]),
+            (form.offset, form.range),
+        )
+        offset, natural = (
+            Interval.unchecked(*(jnp.concatenate([zero, side]) for side in (b.lower, b.upper))) for b in ranges
+        )
+        return widened_atoms(slope, offset, natural, states, self.terms)
+
     def free_at(self, x: Any, u: Any) -> tuple[Any, Any]:
         """Atoms of T2 g at a point, and what rounding leaves of them."""
         if self.expansion is not None:

@@ -109,19 +109,21 @@ def window_residual(window: Any, plant: Any, C: Any, bounded: Any, H_slack: Any)
     return rounded_up(x), np.array(d).reshape(len(window.known), len(x), plant.p)
 
 
-def input_row_residual(rows: Any, plant: Any, H_slack: Any) -> np.ndarray:
-    """What `InputRows` leave of the inputs of their steps, (N, R, p); of states nothing, as in `window_residual`."""
+def input_row_residual(rows: Any, plant: Any, H_slack: Any) -> tuple[np.ndarray, np.ndarray]:
+    """What `InputRows` leave of the inputs of their steps, (N, R, p), and of d[k], (R, p); of states nothing, as in
+    `window_residual`."""
     n, N, (G, H, slack) = plant.n, rows.length, (exact(m) for m in (plant.G, plant.H, H_slack))
-    moves = [exact(part) for part in rows.moves]
+    output, ahead, moves = exact(rows.output), exact(rows.ahead), [exact(part) for part in rows.moves]
+    now = rounded_up(abs(output.dot(H) - ahead) + abs(output).dot(slack))
     found = []
     for lag in range(N):
         of_f, of_g = exact(rows.multipliers[lag][:, :n]), exact(rows.multipliers[lag][:, n:])
         left = of_f.dot(G) + of_g.dot(H) - exact(rows.boxes[lag]) - moves[lag]
-        left = left + moves[lag - 1] if lag else left
+        left = left + (moves[lag - 1] if lag else ahead)
         if lag < rows.over:
             left = left - exact(np.eye(plant.p)[list(rows.targets)])
         found.append(rounded_up(abs(left) + abs(of_g).dot(slack)))
-    return np.array(found).reshape(N, len(rows.targets), plant.p)
+    return np.array(found).reshape(N, len(rows.targets), plant.p), now.reshape(len(rows.targets), plant.p)
 
 
 def upper_inverse(M: np.ndarray) -> np.ndarray | None:

@@ -228,7 +228,8 @@ def _cast_window(window: Any, left_x: np.ndarray, left_d: np.ndarray, T2: np.nda
 def with_input_residual(rows: Any, system: Any, H_slack: np.ndarray, dtype: Any) -> Any:
     """Rows for inputs as they are in that type, with what they leave."""
     rows = jax.tree.map(lambda x: np.asarray(x, dtype), rows)
-    return replace(rows, left=_cast(input_row_residual(rows, system, H_slack), dtype))
+    left, left_now = input_row_residual(rows, system, H_slack)
+    return replace(rows, left=_cast(left, dtype), left_now=_cast(left_now, dtype))
 
 
 def stored_recovery(rows: Any, wide: Any, system: Any, affine: AffineMaps, H_slack: np.ndarray, dtype: Any) -> Any:

@@ -176,7 +176,7 @@ def _contract(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[D
     # boxes lie in the region.
     with _stage("inputs"):
         d, domain = from_inverses(maps, domain, states, d_fixed, psi)
-        d, domain = input_memory.contract(maps, domain, carry, d)
+        d, domain = input_memory.contract(maps, domain, carry, d, y, u, noise)
         moved = moved_without(maps, past, carry, known.terms)
         domain = dynamics(maps, domain, moved, d)
     domain, promised = certified(maps, domain, past, carry, right, known, left[0], newton, u)

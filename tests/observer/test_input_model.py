@@ -189,9 +189,10 @@ def test_step_by_step_and_from_a_file(rated, blocked, tmp_path):
 def test_what_rows_leave_of_the_inputs_is_rounding(rated, blocked):
     for observer, *_ in (rated, blocked):
         rows = observer.input_rows
-        left = input_row_residual(rows, observer.system, np.zeros((2, 1)))
+        left, left_now = input_row_residual(rows, observer.system, np.zeros((2, 1)))
         assert left.max() < 1e-9
         assert (np.asarray(rows.left) >= left).all()
+        assert not left_now.any()  # no input shows in y[k] itself
 
 
 def test_a_nonlinear_plant_in_float32_with_a_gradient(monkeypatch):
