@@ -21,6 +21,7 @@ _ROUNDS, _SAMPLES = 2, 32  # of runs, and samples of each that exact rows are as
 _DRAWN = 100  # samples for sums
 _MIDDLE = 4  # steps of a long block that are simulated beyond those with rows of their own
 _MOST_LAGS, _STRICTER = 64, 10  # steps that rows look back to, in all, for each input: twice as many for rates
+_ALONE = 2.5, 1 / 3  # as many of these, and as small a gain, where there is one input: its rows are few
 _NARROW = 0.05  # of the median width: boxes below count as wide as that where rows are chosen
 _MOST_ROWS, _LEAST_GAIN = 16, 3e-3  # of an input, and share of the width that one more row must bring
 
@@ -73,12 +74,13 @@ def rows_of_inputs(
                 _sampled_rows(found, sizes, kind, kind.of(samples), kind.share(_SAMPLES))
         samples = runs.samples(found, seed=1)
         own: list[int] = []
-        for least in _LEAST_GAIN * 1.5 ** np.arange(_STRICTER):
+        more, less = _ALONE if p == 1 else (1.0, 1.0)
+        for least in less * _LEAST_GAIN * 1.5 ** np.arange(_STRICTER):
             own = list(kept)
             for kind in kinds:
                 _keep(own, found, sizes, kind, kind.of(samples), kind.least(least))
             # Beyond so many terms a compiled step is slower by far more than their number.
-            if depths_of(np.array(found.parts)[own], sizes).sum() <= (1 if block else 2) * _MOST_LAGS * p:
+            if depths_of(np.array(found.parts)[own], sizes).sum() <= more * (1 if block else 2) * _MOST_LAGS * p:
                 break
         kept = own
     return _as_rows(problem, length, found, kept, width, unit) if kept else None

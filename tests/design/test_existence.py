@@ -16,7 +16,7 @@ def design(f, g, G, H, region=None, dw=0.1, dv=0.1, **options):
     n, l = len(G), len(H)
     system = gx.System(f, g, G, H, **options)
     noise = gx.Noise(systems.ball([dw] * n), systems.ball([dv] * l))
-    return gx.design_observer(system, noise, region or Interval.entire(n), missing=False)
+    return gx.design_observer(system, noise, Interval.entire(n) if region is None else region, missing=False)
 
 
 def test_invisible_direction_is_proved_and_named():
