@@ -12,7 +12,7 @@ import numpy as np
 from ..dataset import alarm_records
 from ..observer.alarms import read_alarms
 from ..observer.status import Status
-from ..observer.summary import beyond, unread
+from ..observer.summary import beyond, unpromised, unread
 from .problem import Names, Problem
 
 MOST_ALARMS = 10_000  # with their words; status and margin of the files have all
@@ -105,7 +105,7 @@ def gather(parts: Iterable[np.ndarray], problem: Problem, observer: Any) -> Tota
         totals.beyond += int(np.count_nonzero(beyond(rows["state_lower"], rows["state_upper"], region)))
         lacking, before = unread(rows["status"], before), unread(rows["status"][-1:])[-1]
         totals.unread += int(lacking.sum())
-        totals.outside += int((lacking | (rows["status"] & int(Status.OUTSIDE_REGION) != 0)).sum())
+        totals.outside += unpromised(rows["status"], lacking)
         width = np.concatenate([rows[f"{kind}_upper"] - rows[f"{kind}_lower"] for kind in ("state", "input")], axis=1)
         for index, signal in enumerate(totals.signals):
             signal.add(width[:, index])

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from scipy.optimize import linprog
 
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.recovery import Trial
+from gsisio_jax.design.row_solver import RowSolver
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.cells import counts
 from gsisio_jax.observer.enclosures import Slopes
@@ -78,12 +78,12 @@ def _straight(observer: Observer, u_region: Interval) -> np.ndarray:
         x, u = (np.nan_to_num(np.asarray(b.center, np.float64)) for b in (observer.certificate.region, u_region))
         slope = T2 @ np.asarray(jax.jacfwd(system.measurement)(x, u))
     room = np.abs(T2) @ np.asarray(observer.noise.v.width) / 2
-    rows, room = np.vstack([slope, -slope]), np.concatenate([room, room])
-    widths = np.full(system.n, np.inf)
-    for i in range(system.n if np.isfinite(slope).all() else 0):
-        found = linprog(-np.eye(system.n)[i], A_ub=rows, b_ub=room, bounds=(None, None), method="highs")
-        widths[i] = 2 * float(found.x[i]) if found.status == 0 else np.inf
-    return widths
+    if not np.isfinite(slope).all():
+        return np.full(system.n, np.inf)
+    q, solver = len(slope), RowSolver(np.eye(len(slope)), slope.T)
+    goals = np.hstack([np.zeros((system.n, q)), -np.eye(system.n)])
+    found = [solver.multipliers(goal, room, np.zeros(q)) for goal in goals]
+    return np.array([np.inf if best is None else 2 * best[1] for best in found])
 
 
 def _widths(observer: Observer, u_region: Interval) -> np.ndarray | None:

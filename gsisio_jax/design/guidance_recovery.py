@@ -48,15 +48,15 @@ def recovers(one: Changed, region: Interval, maps: AffineMaps | None) -> bool:
     if _rank(np.vstack([slope[finite], np.eye(n)[bounded]])) == n:
         return True
     problem = one.plan.problem(one.region)
-    problem = problem.scaled(typical_width(problem, region))
-    lost = _infinite(unseen_after(_bounds_alone(problem, bounded), np.zeros((n, 0)), True, True), bounded)
+    unit = typical_width(problem, region)
+    alone = _bounds_alone(problem.scaled(unit), bounded)
+    lost = _infinite(unseen_after(alone, np.zeros((n, 0)), True, True), bounded)
     if not lost.any():
         return True
     if maps is None:
         return False
     nothing = np.zeros(problem.l, bool)
-    problem = one.plan.problem(one.region)
-    affine = affine_problem(problem, _with_sensors(maps, one), nothing, nothing).scaled(typical_width(problem, region))
+    affine = affine_problem(problem, _with_sensors(maps, one), nothing, nothing).scaled(unit)
     # Rows that lean on the box before the gap; and boxes from row to row. No row of an observer uses the bound of a
     # state to find where another one was, so here they serve the states that they are of.
     late = np.where(bounded, 0.0, rows_until_finite(affine, 1))

@@ -83,7 +83,7 @@ def rows_of_inputs(
             if depths_of(np.array(found.parts)[own], sizes).sum() <= more * (1 if block else 2) * _MOST_LAGS * p:
                 break
         kept = own
-    return _as_rows(problem, length, found, kept, width, unit) if kept else None
+    return _as_rows(problem, sizes, found, kept, width, unit) if kept else None
 
 
 def rows_of_sums(problem: GainProblem, system: System, steps: int, width: np.ndarray) -> InputRows | None:
@@ -99,7 +99,7 @@ def rows_of_sums(problem: GainProblem, system: System, steps: int, width: np.nda
     first, fresh = (Sample(0, size, size * rng.uniform(-1, 1, size.shape)) for _ in range(2))
     _sampled_rows(found, sizes, InputKind(steps, True), [first], _SAMPLES)
     _keep(kept, found, sizes, InputKind(steps, True), [fresh], _LEAST_GAIN)
-    return _as_rows(problem, steps, found, kept, width, unit, steps)
+    return _as_rows(problem, sizes, found, kept, width, unit)
 
 
 def _rate(system: System) -> np.ndarray:
@@ -173,10 +173,10 @@ def _add(found: Rows, state: int, parts: np.ndarray, sizes: InputSizes) -> None:
 
 
 def _as_rows(
-    problem: GainProblem, length: int, rows: Rows, kept: list[int], x: np.ndarray, d: np.ndarray, over: int = 1
+    problem: GainProblem, layout: InputSizes, rows: Rows, kept: list[int], x: np.ndarray, d: np.ndarray
 ) -> InputRows:
-    """The kept rows in the units of the plant, newest step first."""
-    n, l, p, N, R = problem.n, problem.l, len(d), length, len(kept)
+    """The kept rows in the units x and d of the plant, newest step first."""
+    n, l, p, N, R = problem.n, problem.l, len(d), layout.length, len(kept)
     parts = np.array([rows.parts[r] for r in kept])
     targets = np.array([rows.states[r] for r in kept])
     sizes = [N * n, n, N * n, N * l, l, N * p, p, N * p]
@@ -189,8 +189,7 @@ def _as_rows(
     )
     multipliers = np.concatenate([of_f, of_g], axis=2)
     # Rows that look back farthest come first, so that those of a lag are the first ones.
-    used = np.concatenate([multipliers, moves, boxes], 2)
-    depth = np.array([np.flatnonzero((used[:, r] != 0).any(-1)).max(initial=0) + 1 for r in range(R)])
+    depth = depths_of(parts, layout)
     order = np.argsort(-depth, kind="stable")
     N = int(depth.max())  # older steps are in no row that was kept
     return InputRows(
@@ -203,5 +202,5 @@ def _as_rows(
         left_now=np.zeros((R, p)),
         targets=tuple(int(targets[r]) for r in order),
         counts=tuple(int((depth > lag).sum()) for lag in range(N)),
-        over=over,
+        over=layout.over,
     )

@@ -109,8 +109,12 @@ def where(est: Estimate, observer: Any = None, u: Any = None) -> Outside:
         boxes = int(np.count_nonzero(beyond(est.state.lower, est.state.upper, region)))
         inputs = None if u is None else int(np.count_nonzero(beyond(u, u, observer.u_region)))
     lacking = unread(status)
-    outside = lacking | (status & int(Status.OUTSIDE_REGION) != 0)
-    return Outside(status.size, int(outside.sum()), boxes, inputs, int(lacking.sum()))
+    return Outside(status.size, unpromised(status, lacking), boxes, inputs, int(lacking.sum()))
+
+
+def unpromised(status: np.ndarray, lacking: np.ndarray) -> int:
+    """How many steps have no promised width: those outside of the region, and those that are `unread`."""
+    return int((lacking | (status & int(Status.OUTSIDE_REGION) != 0)).sum())
 
 
 def unread(status: np.ndarray, before: bool = False) -> np.ndarray:

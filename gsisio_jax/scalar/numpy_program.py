@@ -22,6 +22,7 @@ _CALLS = {
     "jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call",
     "custom_vjp_call_jaxpr",
 }  # fmt: skip
+_MOST_TURNS = 128  # of a loop: a longer one is worth compiling
 
 
 @rare_collection()
@@ -125,7 +126,7 @@ def _operation(eqn: Any) -> Callable[..., Sequence[Any]]:
     if name == "split":
         ends = np.cumsum(params["sizes"])[:-1]
         return lambda x: np.split(x, ends, axis=params["axis"])
-    if name == "scan":
+    if name == "scan" and params["length"] <= _MOST_TURNS:
         return _scan(eqn)
 
     def bound(*args: Any) -> Sequence[Any]:
