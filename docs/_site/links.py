@@ -20,7 +20,11 @@ PAGES = {
     "CHANGELOG.md": "changelog.md",
 }
 LINK = re.compile(r"(\]\()([^)\s#]+)((?:#[^)\s]*)?\))")
-THEORY = re.compile(r"\btheory (\d+)(?:\.(\d+))?\b(?![^<]*</a>)")
+# "theory 2.1", "theory 2.8-2.11", "theory 3, 4 and 6"
+THEORY = re.compile(r"\btheory \d+(?:\.\d+)?(?:(?:,\s+|\s+and\s+|-)\d+(?:\.\d+)?)*\b(?![^<]*</a>)")
+SECTION = re.compile(r"(?:theory )?(\d+)(?:\.(\d+))?")
+# A template of mkdocstrings leaves a space before this bracket.
+DEFAULT = re.compile(r"(default:\s*<code>(?:(?!</code>).)*</code>)\s+\)", re.DOTALL)
 
 
 def outside(source: str, target: str) -> str | None:
@@ -72,6 +76,9 @@ def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
     """Docstrings cite "theory N.M": a link on the pages of the reference."""
     if not page.file.src_uri.startswith("reference/"):
         return html
-    return THEORY.sub(
-        lambda m: f'<a href="../theory.html#theory-{"-".join(filter(None, m.groups()))}">{m.group()}</a>', html
-    )
+
+    def linked(match: re.Match[str]) -> str:
+        anchor = f"theory-{'-'.join(filter(None, match.groups()))}"
+        return f'<a href="../theory.html#{anchor}">{match.group()}</a>'
+
+    return THEORY.sub(lambda match: SECTION.sub(linked, match.group()), DEFAULT.sub(r"\1)", html))

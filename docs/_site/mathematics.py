@@ -11,7 +11,8 @@ from xml.etree import ElementTree
 
 from latex2mathml.converter import convert
 
-INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
+# With what stands beside it without a space: a bracket, a comma, "'s", "-th".
+INLINE = re.compile(r'([(\["]*)<span class="arithmatex">\\\((.*?)\\\)</span>([^\s<]{0,12}(?![^\s<]))?', re.DOTALL)
 # Browsers know no variants but "normal": letters of another alphabet are characters of their own.
 VARIANT = re.compile(r'<(m[in]) mathvariant="(double-struck|script|bold)">(\w)</m[in]>')
 ALPHABETS = {"double-struck": "DOUBLE-STRUCK", "script": "SCRIPT", "bold": "BOLD"}
@@ -93,15 +94,19 @@ def mathml(formula: str, display: str) -> str:
     return _spaced(formula, made)
 
 
-def _inline(formula: str) -> str:
-    """Browsers do not break formulas: on a narrow screen the longest ones scroll within their line."""
-    made = mathml(formula, "inline")
-    return f'<span class="long-formula">{made}</span>' if len(re.sub(r"\\[a-z]+", "", formula)) > 25 else made
+def _inline(match: re.Match[str]) -> str:
+    """Browsers do not break formulas: on a narrow screen the longest ones scroll within their line. They break between
+    a formula and the comma behind it, though: the two are held together."""
+    before, formula, after = match[1], match[2], match[3] or ""
+    made = f"{before}{mathml(formula, 'inline')}{after}"
+    if len(re.sub(r"\\[a-z]+", "", formula)) > 25:
+        return f'<span class="long-formula">{made}</span>'
+    return f'<span class="kept">{made}</span>' if before or after else made
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Any) -> str:
     html = BLOCK.sub(lambda m: f'<div class="formula">{mathml(m[1], "block")}</div>', html)
-    html = INLINE.sub(lambda m: _inline(m[1]), html)
+    html = INLINE.sub(_inline, html)
     if "arithmatex" in html:
         raise ValueError(f"{page.file.src_uri}: a formula was not rendered")
     return html

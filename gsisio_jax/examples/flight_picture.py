@@ -52,12 +52,12 @@ def draw(dataset: xr.Dataset, path: str | Path) -> None:
     """
     figure_module = need("matplotlib.figure", extra="plot", purpose="plotting")
     agg = need("matplotlib.backends.backend_agg", extra="plot", purpose="plotting")
-    figure = figure_module.Figure(figsize=(16.0, 10.0), dpi=100, facecolor="white")
+    figure = figure_module.Figure(figsize=(12.0, 7.5), dpi=1600 / 12, facecolor="white")
     agg.FigureCanvasAgg(figure)
     flight = _Flight(dataset)
     grid = figure.add_gridspec(
-        1 + len(PANELS), 2, width_ratios=[0.9, 1.0], left=0.05, right=0.985, top=0.86, bottom=0.06, hspace=0.14,
-        wspace=0.15,
+        1 + len(PANELS), 2, width_ratios=[0.9, 1.0], left=0.06, right=0.985, top=0.85, bottom=0.075, hspace=0.16,
+        wspace=0.19,
     )  # fmt: skip
     _draw_map(figure.add_subplot(grid[:, 0]), flight)
     panels = [figure.add_subplot(grid[0, 1])]
@@ -69,22 +69,22 @@ def draw(dataset: xr.Dataset, path: str | Path) -> None:
             patches.Patch(color=PALE, label="box while a message is missing"),
             patches.Patch(color=GAP, label=f"no position for {LONG_GAP} s or more"),
         ],
-        loc="lower left", bbox_to_anchor=(-0.01, 1.1), ncols=3, frameon=False, fontsize=9.5, handlelength=1.4,
-        columnspacing=1.2,
+        loc="lower left", bbox_to_anchor=(-0.02, 1.13), ncols=3, frameon=False, fontsize=9, handlelength=1.2,
+        columnspacing=0.9,
     )  # fmt: skip
     for row, (name, limit) in enumerate(PANELS.items(), start=1):
         panels.append(figure.add_subplot(grid[row, 1], sharex=panels[0]))
         _draw_series(panels[-1], flight, name, limit)
     for axes in panels:
-        axes.tick_params(labelbottom=axes is panels[-1])
+        axes.tick_params(labelbottom=axes is panels[-1], labelsize=9)
         axes.grid(color="#e6e6e6", linewidth=0.6)
         axes.set_axisbelow(True)
-        axes.yaxis.set_label_coords(-0.07, 0.5)
+        axes.yaxis.set_label_coords(-0.085, 0.5)
     panels[0].set_xlim(flight.time[0], flight.time[-1])
     panels[-1].set_xlabel("time [s]")
     panels[-1].xaxis.set_major_formatter("{x:,.0f}")
-    figure.text(0.05, 0.966, dataset.attrs.get("title", ""), fontsize=18, fontweight="bold", va="center")
-    figure.text(0.05, 0.931, _sentence(flight), fontsize=12.5, color="#333333", va="center")
+    figure.text(0.05, 0.966, dataset.attrs.get("title", ""), fontsize=16, fontweight="bold", va="center")
+    figure.text(0.05, 0.931, _sentence(flight), fontsize=11, color="#333333", va="center")
     figure.savefig(path)
 
 
@@ -146,6 +146,7 @@ def _sentence(flight: _Flight) -> str:
 def _draw_map(axes: Any, flight: _Flight) -> None:
     _draw_track(axes, flight, lambda row: True)
     axes.set_aspect("equal", adjustable="datalim")
+    axes.tick_params(labelsize=9)
     axes.set_xlabel("plane east [km]")
     axes.set_ylabel("plane north [km]", labelpad=0)
     rows = np.flatnonzero(flight.seen)
@@ -155,8 +156,8 @@ def _draw_map(axes: Any, flight: _Flight) -> None:
         length = gap.last - gap.first + 1
         if length >= LABELLED and gap.first > 0 and gap.last + 1 not in {alarm.row for alarm in flight.alarms}:
             west, south, width, _ = flight.box(gap.last)
-            text = f"{flight.time[gap.last]:,.0f} s, after {length:,} s of silence:\n"
-            _note(axes, (west, south), f"{text}box still finite, {width:,.0f} km wide", (0, -5), BOX, va="top")
+            text = f"{flight.time[gap.last]:,.0f} s, after {length:,} s\nof silence: box still\n"
+            _note(axes, (west, south), f"{text}finite, {width:,.0f} km wide", (4, 5), BOX, va="bottom")
             _note(axes, flight.reported[gap.first - 1] / 1e3, f"{flight.time[gap.first - 1]:,.0f} s", (9, 0), REPORT)
     _zoom(axes, flight)
     lines, patches = (need(f"matplotlib.{name}", extra="plot", purpose="plotting") for name in ("lines", "patches"))
@@ -167,7 +168,7 @@ def _draw_map(axes: Any, flight: _Flight) -> None:
             patches.Patch(facecolor="#f6d5d1", edgecolor=ALARM, label="the same, but they return outside of it"),
             lines.Line2D([], [], color=ALARM, linestyle="--", label="jump beyond any airliner's speed"),
         ],
-        loc="lower left", fontsize=10, framealpha=0.95,
+        loc="lower left", fontsize=8.5, framealpha=0.95,
     )  # fmt: skip
 
 
@@ -201,10 +202,10 @@ def _zoom(axes: Any, flight: _Flight) -> None:
         start, end = flight.reported[alarm.before] / 1e3, flight.reported[alarm.row] / 1e3
         way = float(np.linalg.norm(end - start))
         if not (window_free and 0.0 < way < 100.0):
-            _note(axes, 0.3 * start + 0.7 * end, alarm.text, (-14, 0), ALARM, ha="right")
+            _note(axes, 0.42 * start + 0.58 * end, alarm.text, (-14, 0), ALARM, ha="right")
             continue
         window_free = False
-        inset = axes.inset_axes((0.575, 0.715, 0.405, 0.27))
+        inset = axes.inset_axes((0.5, 0.66, 0.48, 0.325))
         _draw_track(inset, flight, lambda row, at=alarm.row: row in (at, at - 1), size=5.0)
         middle = 0.5 * (start + end)
         inset.set_xlim(middle[0] - 0.8 * way, middle[0] + 0.8 * way)
@@ -212,7 +213,7 @@ def _zoom(axes: Any, flight: _Flight) -> None:
         inset.set_aspect("equal")
         inset.tick_params(labelsize=8, direction="in")
         inset.text(
-            0.04, 0.97, alarm.text, transform=inset.transAxes, va="top", color=ALARM, fontweight="bold", fontsize=10
+            0.04, 0.97, alarm.text, transform=inset.transAxes, va="top", color=ALARM, fontweight="bold", fontsize=8.5
         )
         axes.indicate_inset_zoom(inset, edgecolor="#555555")
 
@@ -221,8 +222,8 @@ def _note(
     axes: Any, at: Any, text: str, offset: tuple[int, int], colour: str, va: str = "center", ha: str = "left"
 ) -> None:
     axes.annotate(
-        text, at, xytext=offset, textcoords="offset points", va=va, ha=ha, color=colour, fontsize=10,
-        fontweight="bold" if colour == ALARM else "normal",
+        text, at, xytext=offset, textcoords="offset points", va=va, ha=ha, color=colour,
+        fontsize=8.5, fontweight="bold" if colour == ALARM else "normal",
         bbox={"facecolor": "white", "alpha": 0.75, "edgecolor": "none", "pad": 1.0},
     )  # fmt: skip
 
@@ -232,13 +233,14 @@ def _draw_width(axes: Any, flight: _Flight) -> None:
     width = (flight.upper - flight.lower).max(axis=-1) / 1e3
     axes.semilogy(flight.time, np.where(np.isfinite(width), width, np.nan), color=BOX, linewidth=0.9)
     axes.set_ylabel("position box\nwidth [km]")
+    axes.yaxis.set_major_locator(need("matplotlib.ticker", extra="plot", purpose="plotting").LogLocator(numticks=9))
     axes.yaxis.set_major_formatter("{x:,g}")
     _mark_times(axes, flight)
     for gap in flight.gaps:
         if gap.last - gap.first + 1 >= LABELLED:
             middle = 0.5 * (flight.time[gap.first] + flight.time[gap.last])
             text = f"{gap.last - gap.first + 1:,} s"
-            axes.text(middle, 0.08, text, transform=axes.get_xaxis_transform(), ha="center", fontsize=10)
+            axes.text(middle, 0.08, text, transform=axes.get_xaxis_transform(), ha="center", fontsize=9)
     ends = [flight.time[alarm.row] for alarm in flight.alarms]
     for index, time in enumerate(ends):
         crowded = index + 1 < len(ends) and ends[index + 1] - time < 0.2 * (flight.time[-1] - flight.time[0])
@@ -262,7 +264,7 @@ def _draw_series(axes: Any, flight: _Flight, name: str, limit: float | None) -> 
     if limit is not None and np.nanmax(np.abs(np.stack([lower, upper]))) > limit:
         axes.set_ylim(-limit, limit)
         axes.text(
-            0.995, 0.05, f"axis cut at ±{limit:g} {unit}", transform=axes.transAxes, ha="right", fontsize=8.5,
+            0.995, 0.05, f"axis cut at ±{limit:g} {unit}", transform=axes.transAxes, ha="right", fontsize=8,
             bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0},
         )  # fmt: skip
 

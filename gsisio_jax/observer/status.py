@@ -13,18 +13,28 @@ import numpy as np
 class Status(enum.IntFlag):
     """Bit mask per step and batch element. OK is 0.
 
-    Source: theory 8.
+    Attributes:
+        CONFLICT: 1, an intersection is empty: the data contradict the stated bounds (a certified alarm).
+        MISSING: 2, an entry of y is missing.
+        UNBOUNDED: 4, some side of the state box is infinite.
+        OUTSIDE_REGION: 8, boxes are certain, but the width promise does not apply.
+        CROSSED: 16, prediction form only: the printed recursion lost its order.
+        AMBIGUOUS: 32, periodic outputs only: several multiples of the period fit, so the entry says less, or nothing.
+        PENDING: 64, observers with a delay, online: the step that this one would finish lies before the record.
+        OUTVOTED: 128, ``tolerate`` only: not all outputs agree, and one is left out or in doubt.
+
+    Source: theory 8.3.
     """
 
     OK = 0
-    CONFLICT = 1  # an intersection is empty: the data contradict the stated bounds (a certified alarm)
-    MISSING = 2  # an entry of y is missing
-    UNBOUNDED = 4  # some side of the state box is infinite
-    OUTSIDE_REGION = 8  # boxes are certain, but the width promise does not apply
-    CROSSED = 16  # prediction form only: the printed recursion lost its order
-    AMBIGUOUS = 32  # periodic outputs only: several multiples of the period fit, so the entry says less, or nothing
-    PENDING = 64  # observers with a delay, online: the step that this one would finish lies before the record
-    OUTVOTED = 128  # `tolerate` only: not all outputs agree, and one is left out or in doubt
+    CONFLICT = 1
+    MISSING = 2
+    UNBOUNDED = 4
+    OUTSIDE_REGION = 8
+    CROSSED = 16
+    AMBIGUOUS = 32
+    PENDING = 64
+    OUTVOTED = 128
 
 
 def bit_mask(bits: Iterable[tuple[Any, Status]]) -> Any:

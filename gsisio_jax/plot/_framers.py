@@ -115,7 +115,10 @@ def _panel(axis: Any, record: Record, series: Series, truth: Any) -> None:
     # Infinite sides are drawn just outside the panel, so that the band fills it.
     beyond = high - low
     outside = (low - beyond, high + beyond)
-    at, bottom, top = thinned(time, np.clip(lower, *outside), np.clip(upper, *outside))
+    # Without a last box, that of an input, edges would go on for half a step behind the end of the band.
+    known = np.flatnonzero(~(np.isnan(lower) | np.isnan(upper)))
+    end = int(known[-1]) + 1 if len(known) else len(time)
+    at, bottom, top = thinned(time[:end], np.clip(lower, *outside)[:end], np.clip(upper, *outside)[:end])
     step = "mid" if len(at) <= 400 else None
     unbounded = bool((np.isinf(lower) | np.isinf(upper)).any())
     text = "guaranteed box (full height: not bounded)" if unbounded else "guaranteed box"

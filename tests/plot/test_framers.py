@@ -119,6 +119,14 @@ def test_an_estimate_is_drawn_with_numbered_names(est):
     assert "truth" not in axes[1].get_legend_handles_labels()[1]
 
 
+def test_edges_end_where_the_band_of_an_input_ends(data):
+    (axis,) = np.atleast_1d(plot.framers(data, signals=["leak"]))
+    band = max(path.vertices[:, 0].max() for collection in axis.collections for path in collection.get_paths()[:1])
+    edges = [line.get_xdata() for line in axis.lines if line.get_drawstyle() == "steps-mid"]
+    assert [x.max() for x in edges] == [0.5 * (STEPS - 2)] * 2
+    assert band == 0.5 * (STEPS - 2)
+
+
 def test_own_axes_are_returned(data):
     from matplotlib.figure import Figure
 
