@@ -60,15 +60,18 @@ class Report:
 class Checker:
     """A test system, with its gradient and its values compiled for `points` points.
 
-    `through` is what the gradient goes through, `score` or `folded`; `options` are those of the design.
+    `through` is what the gradient goes through, `score` or `folded`; `jit` compiles, or stands in for it; `options` are
+    those of the design.
     """
 
-    def __init__(self, case: systems.Case, points: int, through: Callable[..., Any], **options: Any):
+    def __init__(
+        self, case: systems.Case, points: int, through: Callable[..., Any], jit: Any = jax.jit, **options: Any
+    ):
         self.case, self.points = replace(case, steps=STEPS), points
         observer, u = case.design(missing=False, **options), jnp.asarray(case.u(STEPS))
-        self.gradients = jax.jit(jax.vmap(jax.grad(lambda at: through(observer, u, at))))
-        self.values = jax.jit(jax.vmap(lambda at: score(observer, u, at)))
-        self.estimates = jax.jit(jax.vmap(lambda at: gx.estimate(observer, at[0], at[1], u, at[2])))
+        self.gradients = jit(jax.vmap(jax.grad(lambda at: through(observer, u, at))))
+        self.values = jit(jax.vmap(lambda at: score(observer, u, at)))
+        self.estimates = jit(jax.vmap(lambda at: gx.estimate(observer, at[0], at[1], u, at[2])))
 
     def draw(self, seed: int = 5) -> Any:
         """Random initial boxes, records and noise bounds around those of the system, as NumPy arrays."""

@@ -2,8 +2,7 @@
 
     p+ = p + h v + h^2/2 a + w_p        v+ = v + h a + w_v        y = (p, v) + noise        |v| <= SPEED, a: anything
 
-`oracles.linear_observer` has its exact boxes. All records have STEPS rows and run in batches of BATCH, so that one
-compilation serves every test.
+`oracles.linear_observer` has its exact boxes. All records have STEPS rows.
 """
 
 from dataclasses import dataclass
@@ -59,22 +58,11 @@ class Target:
         )
 
     def run(self, y: Any, on_conflict: str = "restart", initial: Interval | None = None) -> gx.Estimate:
-        """Estimate of up to BATCH records (records, STEPS, 2), each with its own initial box if wanted."""
-        y = np.asarray(y)
+        """Estimate of records (records, STEPS, 2), each with its own initial box if wanted."""
         box = self.initial if initial is None else initial
-        shape = (len(y), 2)
-        box = Interval(np.broadcast_to(box.lower, shape), np.broadcast_to(box.upper, shape))
-        fill = [(0, BATCH - len(y))]
-        padded = jax.tree.map(
-            lambda leaf: jnp.asarray(np.pad(leaf, fill + [(0, 0)] * (leaf.ndim - 1), "edge")), (box, y)
-        )
-        est = _estimates(self.observer, *padded, on_conflict)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[: len(y)], est)
-
-
-@partial(jax.jit, static_argnums=3)
-def _estimates(observer: gx.Observer, initial: Interval, y: Any, on_conflict: str) -> gx.Estimate:
-    return jax.vmap(lambda box, rows: gx.estimate(observer, box, rows, on_conflict=on_conflict))(initial, y)
+        box = Interval(*(jnp.broadcast_to(side, (len(y), 2)) for side in (box.lower, box.upper)))
+        found = jax.vmap(partial(gx.estimate, self.observer, on_conflict=on_conflict))(box, jnp.asarray(y))
+        return jax.tree.map(np.asarray, found)
 
 
 def design() -> Target:

@@ -38,6 +38,7 @@ from gsisio_jax.continuous import maps, sides
 from gsisio_jax.continuous.exponential import integral_upper
 from gsisio_jax.continuous.field import Field
 from gsisio_jax.continuous.sides import Sides
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 _ROUNDS, _TIGHTER = 40, 3
 _INFLATION = 0.1
@@ -128,8 +129,24 @@ class StepError:
         )
 
     def _rate(self, around: Sides) -> Sides:
-        form = inclusion.affine(self.field.of_z)(sides.box(sides.joined(around, self.u, self.d)))
-        return sides.sides(form.range)
+        return self._range("rate", self.field.of_z, sides.joined(around, self.u, self.d))
+
+    def _range(self, name: str, function: Callable[[Any], Any], around: Sides) -> Sides:
+        return sides.sides(self._bounds(name, inclusion.affine, function, around).range)
+
+    def _bounds(self, name: str, transform: Callable[..., Any], function: Callable[..., Any], *around: Sides) -> Any:
+        """Of the function of that name on boxes, in NumPy: the few times that it is asked for are not worth compiling
+        hundreds of operations. Of high derivatives there are thousands, and tracing takes longer than that."""
+        boxes, programs = [sides.box(pair) for pair in around], self._programs
+        if self.order > 3 and name != "rate":
+            return transform(function)(*boxes)
+        if name not in programs:
+            programs[name] = numpy_function(transform(function), *boxes)
+        return programs[name](*boxes)
+
+    @cached_property
+    def _programs(self) -> dict[str, Callable[..., Any]]:
+        return {}
 
     @cached_property
     def _solution(self) -> Callable[..., Any]:
@@ -144,8 +161,7 @@ class StepError:
         function, q = self.field.rate, self.order
         if q > 1:
             function = _first(self._solution, q)
-        u, d = map(sides.box, (self.u, self.d))
-        found = sides.sides(inclusion.jacobian(function)(sides.box(around), u, d))
+        found = sides.sides(self._bounds("slopes", inclusion.jacobian, function, around, self.u, self.d))
         found = tuple(side.reshape(q, self.field.n, self.field.n) for side in found)
         if not np.isfinite(found).all():
             k = int(np.argwhere(~np.isfinite(found).all((0, 2, 3)))[0, 0])
@@ -157,14 +173,14 @@ class StepError:
         slopes = self._lipschitz(around)
         found = sides.apply((slopes[0][-1], slopes[1][-1]), rate)
         if not self.field.own_derivative:
-            everything = sides.box(sides.joined(around, self.u, self.d))
+            everything = sides.joined(around, self.u, self.d)
             try:
-                last = inclusion.affine(self._of_z(lambda *a: self._solution(*a)[q]))(everything).range
+                last = self._range("last", self._of_z(lambda *a: self._solution(*a)[q]), everything)
             except (inclusion.UnknownPrimitiveError, NotImplementedError):  # no derivative of f to be had
                 if q > 1:
                     raise
             else:
-                found = sides.meet(found, sides.sides(last))
+                found = sides.meet(found, last)
         return sides.times(_share(self.h, q + 1), found)
 
     def _mismatch(self, x: Sides) -> Sides:
@@ -177,11 +193,11 @@ class StepError:
             return sum(c * found[k] for k, c in enumerate(powers)) - jnp.asarray(self.G) @ d
 
         from_zero = np.minimum(self.d[0], 0), np.maximum(self.d[1], 0)
-        slopes = inclusion.jacobian(terms)(*map(sides.box, (from_zero, x, self.u)))
+        slopes = self._bounds("terms of d", inclusion.jacobian, terms, from_zero, x, self.u)
         found = sides.apply(sides.sides(slopes), self.d)
         # The powers of h are rounded, in two terms of every order.
-        sizes = inclusion.affine(self._of_z(solution))(sides.box(sides.joined(x, self.u, from_zero))).range
-        radius = np.finfo(np.float64).eps * (np.array(powers) @ sides.magnitude(sides.sides(sizes)))
+        sizes = self._range("solution", self._of_z(solution), sides.joined(x, self.u, from_zero))
+        radius = np.finfo(np.float64).eps * (np.array(powers) @ sides.magnitude(sizes))
         return sides.add(found, sides.symmetric(radius * (1 + 1e-9) + 1e-300))
 
     @cached_property
@@ -193,18 +209,16 @@ class StepError:
 
     def _of_method(self, x: Sides) -> Sides:
         q, n = self.order, self.field.n
-        x_box, u_box = map(sides.box, (x, self.u))
-        slopes = inclusion.jacobian(lambda s, x, u: self._method(s[0], x, u)[:q])(
-            sides.box(self._length()), x_box, u_box
-        )
+        terms = _first(lambda s, x, u: self._method(s[0], x, u), q)
+        slopes = self._bounds("slopes of method", inclusion.jacobian, terms, self._length(), x, self.u)
         if not np.isfinite(np.array(sides.sides(slopes))).all():
             raise ValueError(_rough(q - 1, q, x))
-        everything = sides.box(sides.joined(self._length(), x, self.u))
-        last = inclusion.affine(lambda z: self._method(z[0], z[1 : n + 1], z[n + 1 :])[q])(everything).range
-        return sides.negative(sides.times(_share(self.h, q + 1), sides.sides(last)))
+        everything = sides.joined(self._length(), x, self.u)
+        last = self._range("last of method", lambda z: self._method(z[0], z[1 : n + 1], z[n + 1 :])[q], everything)
+        return sides.negative(sides.times(_share(self.h, q + 1), last))
 
     def _spreading(self, around: Sides) -> np.ndarray:
-        low, high = sides.sides(inclusion.jacobian(self.field.rate)(*map(sides.box, (around, self.u, self.d))))
+        low, high = sides.sides(self._bounds("spread", inclusion.jacobian, self.field.rate, around, self.u, self.d))
         larger = sides.magnitude((low, high))
         np.fill_diagonal(larger, np.diagonal(high))
         return integral_upper(larger, self.spread, self.h)
@@ -212,24 +226,22 @@ class StepError:
     def _rounding(self, x: Sides) -> Sides:
         """Coefficients are off by eps of themselves, those of Runge-Kutta by twice that (the step, and its sixth)."""
         none = np.zeros(self.field.p), np.zeros(self.field.p)
-        everything = sides.box(sides.joined(x, self.u, none))
+        everything = sides.joined(x, self.u, none)
         if self.runge_kutta:
             n = self.field.n
-            start = sides.box(sides.joined(self._length(), x, self.u))
-            stages = inclusion.affine(lambda z: _stages(self.field, z[0], z[1 : n + 1], z[n + 1 :]))(start).range
-            first = sides.magnitude(sides.sides(stages)).max(0)
+            start = sides.joined(self._length(), x, self.u)
+            stages = self._range("stages", lambda z: _stages(self.field, z[0], z[1 : n + 1], z[n + 1 :]), start)
+            first = sides.magnitude(stages).max(0)
             slopes = sides.magnitude(
-                sides.sides(inclusion.affine(lambda z: self._method(z[0], z[1 : n + 1], z[n + 1 :])[0])(start).range)
+                self._range("first of method", lambda z: self._method(z[0], z[1 : n + 1], z[n + 1 :])[0], start)
             )
             radius = 2 * self.eps * self.h * (first + slopes)
         elif self.order == 1:
-            radius = (
-                self.eps * self.h * sides.magnitude(sides.sides(inclusion.affine(self.field.of_z)(everything).range))
-            )
+            radius = self.eps * self.h * sides.magnitude(self._range("rate", self.field.of_z, everything))
         else:
-            terms = inclusion.affine(self._of_z(_first(self._solution, self.order)))(everything).range
+            terms = self._range("terms", self._of_z(_first(self._solution, self.order)), everything)
             weights = [maps.coefficient(self.h, k) for k in range(1, self.order + 1)]
-            radius = self.eps * (np.array(weights) @ sides.magnitude(sides.sides(terms)))
+            radius = self.eps * (np.array(weights) @ sides.magnitude(terms))
         if self.field.p:
             radius = radius + self.eps * (abs(self.G) @ sides.magnitude(self.d))
         return sides.symmetric(radius * (1 + 1e-9) + 1e-300)

@@ -78,7 +78,7 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
             raise UnknownPrimitiveError(error.operation, error.detail, line) from None
         except (NotImplementedError, TooManyPlacesError, TurnsError) as error:
             raise UnknownPrimitiveError(eqn.primitive.name, str(error), _caller(eqn)) from None
-        results = out if eqn.primitive.multiple_results else [out]
+        results = out if rule is None and eqn.primitive.multiple_results else [out]  # a rule gives the only result
         remember(eqn, operands, results, rule)
         values.update(zip(eqn.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.outvars]

@@ -180,7 +180,8 @@ class Interval(eqx.Module):
         if is_concrete(margin) and np.isnan(margin).any():
             raise ValueError("Interval.contains: `margin` is NaN; give a number in the unit of the box")
         _check_fits(self.shape, value.shape)
-        return (self.lower + margin <= value) & (value <= self.upper - margin)
+        inside = _inside if _namespace(self.lower, self.upper, value) is np else _compiled_inside
+        return inside(self.lower, self.upper, value, margin)
 
     def astype(self, dtype: Any) -> Interval:
         """The smallest box of that floating type that contains this one (a narrowing cast rounds outward)."""
@@ -215,6 +216,13 @@ def _check_fits(box: tuple[int, ...], value: tuple[int, ...]) -> None:
             f"Interval.contains: `value` of shape {value} does not fit the box of shape {box}; give one number for "
             f"each side, shape {box}" + (f", or {('...', *box)} for many".replace("'...'", "...") if box else "")
         )
+
+
+def _inside(lower: Any, upper: Any, value: Any, margin: Any) -> Any:
+    return (lower + margin <= value) & (value <= upper - margin)
+
+
+_compiled_inside = jax.jit(_inside, inline=True)  # one program instead of one for each operation
 
 
 def _namespace(*values: Any) -> Any:

@@ -92,7 +92,8 @@ def faint(weights: Any) -> Any:
         return 0.0
     small = ((weights != 0) & (abs(weights) < 2.0**-40)).any(-1)
     dtype = jnp.result_type(weights)
-    return jnp.where(small, jnp.asarray(2.0**10 * float(jnp.finfo(dtype).tiny), dtype), 0)
+    lost = jnp.finfo(dtype).dtype.type(2.0**10 * float(jnp.finfo(dtype).tiny))
+    return np.where(small, lost, dtype.type(0)) if isinstance(weights, np.ndarray) else jnp.where(small, lost, 0)
 
 
 def products(matrix: Any, x: Interval) -> tuple[Any, Any]:

@@ -34,7 +34,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, Literal
 
 import jax
@@ -252,7 +252,13 @@ def _normal(x: Any, side: float) -> Any:
         x = np.asarray(x)
         outward_side = np.where(x * side > 0, x.dtype.type(side * tiny), x.dtype.type(0))
         return np.where((x != 0) & (np.abs(x) < tiny), outward_side, x)
-    # By its bits: a comparison may already see zero.
+    return _normal_bits(x, side)
+
+
+@partial(jax.jit, static_argnames="side", inline=True)
+def _normal_bits(x: Any, side: float) -> Any:
+    """By its bits: a comparison may already see zero. One program where x is given, not one for each operation."""
+    tiny = float(jnp.finfo(x.dtype).tiny)
     kind = jnp.int64 if x.dtype == jnp.float64 else jnp.int32
     fixed = jax.lax.stop_gradient(x)
     bits = jax.lax.bitcast_convert_type(fixed, kind)

@@ -91,17 +91,24 @@ def _values(observer: Observer, noise: Any, records: Any, room: Any) -> Score:
     return jax.vmap(one)(noise)
 
 
-def _gradients(observer: Observer, noise: Any, records: Any, room: Any, mix: Any) -> Any:
-    """Value and gradient, record by record, of the penalty (mix 1) or of the first violation (mix 0)."""
+def _gradient(observer: Observer, noise: Any, record: Any, room: Any, mix: Any) -> Any:
+    """Value and gradient of the penalty (mix 1) or of the first violation (mix 0) of one record, with its score."""
 
-    def one(noise: Any, record: Any) -> Any:
+    def one(noise: Any) -> Any:
         score = score_record(observer, noise, record, room)
         return jnp.where(mix, score.penalty, jnp.where(jnp.isfinite(score.first), score.first, 0)), score
 
-    return jax.vmap(jax.value_and_grad(one, has_aux=True), in_axes=(None, 0))(noise, records)
+    return jax.value_and_grad(one, has_aux=True)(noise)
 
 
-SMALL = 5000  # rows of all records together up to which compiling costs more than running
+def _gradients(observer: Observer, noise: Any, records: Any, room: Any, mix: Any) -> Any:
+    """Record by record."""
+    return jax.vmap(lambda record: _gradient(observer, noise, record, room, mix))(records)
+
+
+# Up to these, rows of all records together and of one, compiling costs more than running: unoptimised loops are slow
+# for each step that they make (the flight: 4 ms instead of .2), whatever a step does.
+SMALL, SHORT = 5000, 400
 
 
 @cache
@@ -132,14 +139,14 @@ class Scores:
         self._chosen = jax.tree.map(lambda a: a[index], self._records)
         self._room = jnp.asarray(room, dtype)
         self._dtype = dtype
-        self._rows = len(records) * records.y.shape[1]
+        self._small = len(records) * records.y.shape[1] <= SMALL and records.y.shape[1] <= SHORT
 
     def values(self, factors: np.ndarray) -> Score:
         """Scores of several factors (points, k), at most `POINTS`: arrays (points, R) over all records."""
         points = len(factors)
         full = np.concatenate([factors, np.repeat(factors[-1:], POINTS - points, axis=0)])
         # The compiled programs know bounds, not factors: another parametrisation compiles nothing.
-        program = _program(False, self._rows <= SMALL)
+        program = _program(False, self._small)
         score = program(self._observer, self.shape.noise(full).astype(self._dtype), self._records, self._room)
         self.calls += points
         return Score(*(np.asarray(a)[:points] for a in score))
@@ -151,7 +158,7 @@ class Scores:
     def gradient(self, factors: np.ndarray, penalty: bool) -> tuple[np.ndarray, np.ndarray, Score]:
         """Of the penalties, or of the first violations, of the fitted records: (R,), (R, k), and the scores."""
         noise = self.shape.noise(factors).astype(self._dtype)
-        program = _program(True, self._rows <= SMALL)
+        program = _program(True, self._small)
         (value, score), slope = program(self._observer, noise, self._chosen, self._room, jnp.asarray(penalty))
         self.calls += 1
         return np.asarray(value), self.shape.pull(slope), Score(*map(np.asarray, score))

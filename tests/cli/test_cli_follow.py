@@ -11,6 +11,8 @@ import pytest
 
 from gsisio_jax.cli import follow, tail
 
+COMPILED = True
+
 
 def pipe(monkeypatch, text, *pieces):
     """Standard input that hands out the pieces one after the other, then ends."""

@@ -25,6 +25,7 @@ from gsisio_jax.cli.stopping import Terminated, exit_code, stoppable
 from gsisio_jax.cli.study_files import begun_anew
 from gsisio_jax.cli.study_report import Effort, summarise
 
+COMPILED = True  # bits are compared with those of other processes
 FILES = ["cart_sweep.nc", "cart_sweep.zarr", "cart_sweep_curves.png", "cart_sweep_heatmap.png"]
 
 

@@ -21,6 +21,8 @@ from gsisio_jax import Interval, _whole
 from gsisio_jax.files import container, tree
 from gsisio_jax.observer.fixed import Fixed
 
+COMPILED = True
+
 HERE = Path(__file__).parent
 
 

@@ -46,7 +46,7 @@ def samples(boxes, u):
     grid = np.stack(np.meshgrid(share, share), -1).reshape(-1, 2)
     points = boxes.lower[:, None] + grid * (boxes.upper - boxes.lower)[:, None]
     points = np.where(grid == 1, boxes.upper[:, None], points)
-    return points, jax.vmap(lambda xs, v: jax.vmap(lambda x: curved(x, v))(xs))(points, u)
+    return points, in_numpy(jax.vmap(lambda xs, v: jax.vmap(lambda x: curved(x, v))(xs)))(points, u)
 
 
 def test_every_subset_contains_the_function(forms):
@@ -71,8 +71,8 @@ def test_the_intersection_is_no_wider_than_its_parts(forms):
 
 def test_outside_its_region_an_abstraction_says_nothing(planes):
     wide = Interval(REGION.lower - 0.1, REGION.upper)
-    assert np.isinf(bound(curved, ["abstraction"], planes)(wide, np.zeros(1)).range.width).all()
-    assert np.isfinite(bound(curved, ["abstraction", "natural"], planes)(wide, np.zeros(1)).range.width).all()
+    assert np.isinf(in_numpy(bound(curved, ["abstraction"], planes))(wide, np.zeros(1)).range.width).all()
+    assert np.isfinite(in_numpy(bound(curved, ["abstraction", "natural"], planes))(wide, np.zeros(1)).range.width).all()
 
 
 def test_bad_choices():

@@ -230,6 +230,13 @@ def test_reading_keeps_the_function(seed):
             assert value == _exact(out.ravel()[0], points)
 
 
+def test_hinges_may_end_in_a_call():
+    """`jnp.clip` is one equation, a call, and here the last one of a sum of hinges."""
+    form = inclusion.affine(lambda x: jnp.clip(jnp.abs(x) + x, -0.4, 0.7))(Interval([-1.0], [2.0]))
+    jac = inclusion.jacobian(lambda x: jnp.clip(jnp.abs(x) + x, -0.4, 0.7))(Interval([-1.0], [2.0]))
+    assert (form.range.lower, form.range.upper, jac.lower, jac.upper) == (0.0, 0.7, 0.0, 2.0)
+
+
 def test_error_of_a_table_is_exact():
     """Knots and values that are no floating numbers, and knots that rounding takes for one."""
     jumps = {Fraction(1, 3): Fraction(2, 7), Fraction(1, 3) + Fraction(1, 10**17): Fraction(-1, 7), Fraction(2): F(1)}

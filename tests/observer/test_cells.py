@@ -12,8 +12,6 @@ from gsisio_jax.design.cells import _moved_freely, _straight
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.observer.cells import counts
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 BEACONS = 30 * np.array([[1.0, 0.0], [0.0, 1.0], [-0.8, -0.7]])  # m
 NOISE = np.array([0.05, 0.05, 0.05, 0.02])  # m, and rad
 STEPS, LOST, WRONG = 30, 12, 20

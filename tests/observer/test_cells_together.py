@@ -15,8 +15,6 @@ import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 from gsisio_jax.observer import cells
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 RUNS, STEPS = 64, 12
 ball = Interval.symmetric
 

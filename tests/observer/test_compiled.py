@@ -11,6 +11,8 @@ import gsisio_jax as gx
 from gsisio_jax import Interval
 from gsisio_jax.observer import compiled
 
+COMPILED = True
+
 NOISE = gx.Noise(Interval.symmetric([1e-3, 1e-3]), Interval.symmetric([0.05, 0.1]))
 BOX = Interval([-1.0, -1.0], [2.0, 2.0])
 Y = np.array([[0.0, 1.0], [0.12, 1.1], [0.2, 1.3]])

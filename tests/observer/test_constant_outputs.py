@@ -8,8 +8,6 @@ import systems
 
 import gsisio_jax as gx
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 STEPS = 12
 NOISE = gx.Noise(systems.ball([0.1, 0.1]), systems.ball([0.1, 0.1]))
 

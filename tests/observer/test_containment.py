@@ -10,6 +10,8 @@ import systems
 
 import gsisio_jax as gx
 
+COMPILED = True
+
 # (case, runs): at least 20,000 steps each.
 CASES = {
     "S4b": (systems.s4(True), 200),

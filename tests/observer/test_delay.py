@@ -14,8 +14,6 @@ from oracles.record_hull import exact_hull
 import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 STEPS = 24
 
 

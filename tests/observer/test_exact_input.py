@@ -13,8 +13,6 @@ from gsisio_jax.interval.image import image
 from gsisio_jax.observer.domain import Domain
 from gsisio_jax.observer.input_boxes import exact_input
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 
 def plant(input_bounds=None):
     """Three states, three outputs, two inputs that enter nearly everything: a tall [G; H] without zeros."""

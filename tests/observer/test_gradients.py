@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import systems
 from gradient_points import KINDS, Checker, score
+from oracles.uncompiled import in_numpy
 
 import gsisio_jax as gx
 
@@ -14,7 +15,7 @@ POINTS = 100
 @pytest.fixture(scope="module")
 def paper() -> Checker:
     # One sweep compiles in half the time; the default is in the table of `python -m benchmarks.gradients`.
-    return Checker(systems.s1(), POINTS, score, sweeps=1)
+    return Checker(systems.s1(), POINTS, score, in_numpy, sweeps=1)
 
 
 def test_equal_to_central_differences(paper):

@@ -9,8 +9,6 @@ from information import changed
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 STEPS = 100
 
 

@@ -12,8 +12,6 @@ from information import KINDS, Plant, excess
 
 import gsisio_jax as gx
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 ROUNDING = 1e-6
 # Share by which some width is larger at some step with more known, as measured, and why.
 LEFT = {

@@ -13,8 +13,6 @@ from gsisio_jax import Interval
 from gsisio_jax.design import input_rows
 from gsisio_jax.observer.residuals import input_row_residual
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 A, G = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.005], [0.1]])
 W, V, START = np.array([1e-3, 1e-3]), np.array([0.1, 0.1]), np.array([1.0, 1.0])
 NOISE = gx.Noise(Interval.symmetric(W), Interval.symmetric(V))

@@ -11,8 +11,6 @@ import target as tg
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 ROUNDING = 1e-9
 GAP = slice(8, 58)  # fifty rows
 

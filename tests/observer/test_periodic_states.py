@@ -15,8 +15,6 @@ import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 from gsisio_jax.observer.estimation import collect, resume
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 RUNS = 4
 
 

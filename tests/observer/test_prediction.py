@@ -12,8 +12,6 @@ import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 from gsisio_jax.design.framer import framer_gains
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 RUNS = 20
 # Last widths of theory 12.2, decomposition bounds alone; (c) diverges.
 PRINTED = {"a": (1.89, 3.44), "b": (1.44, 1.47), "c": None}

@@ -7,8 +7,6 @@ import pytest
 import gsisio_jax as gx
 from gsisio_jax import Interval, inclusion
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 
 def _ball(radii):
     return Interval(-np.asarray(radii), np.asarray(radii))

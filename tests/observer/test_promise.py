@@ -10,8 +10,6 @@ import pytest
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 BEACONS = np.array([[0.0, 0], [200, 0], [0, 200], [200, 200]])
 LOWER, UPPER = np.array([60.0, 60]), np.array([150.0, 150])
 NOISE = gx.Noise(w=Interval.symmetric([0.05] * 2), v=Interval.symmetric([0.5] * 4))

@@ -13,8 +13,6 @@ from recovery_plants import DETERMINED, PLANTS, designed, records, steps_until_d
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 FAULT = 10
 
 
@@ -91,7 +89,6 @@ def test_rows_hold_for_inputs_and_states_of_any_size(name, dtype, lost):
     A, C, G, H, w, v = (np.asarray(part, np.longdouble) for part in PLANTS[name])
     first = lost + 1 if lost else int(max(observer.certificate.recovery_steps))
 
-    @jax.jit
     def run(side, y, v):
         noise = gx.Noise(observer.noise.w, Interval(-v, v)).astype(dtype)
         return jax.vmap(lambda y: gx.estimate(observer, Interval(-side, side), y, noise=noise).state)(y)

@@ -9,8 +9,6 @@ from scipy.optimize import linprog
 
 import gsisio_jax as gx
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 
 def exact_width(name, rows, state, start=np.inf):
     """Width of the hull of a state at the last of these steps, all measurements 0 (those of a pattern False are lost),

@@ -8,8 +8,6 @@ import pytest
 import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 ROWS, FAULT, RUNS = 80, 10, 50
 
 

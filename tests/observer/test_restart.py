@@ -7,8 +7,6 @@ import pytest
 import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 TURN = 0.95 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
 C = np.array([[1.0, 0], [0, 1], [1, 1], [1, -1]])
 ROWS, K = 8, 4

@@ -12,8 +12,6 @@ import gsisio_jax as gx
 from gsisio_jax import Interval
 from gsisio_jax.observer.slices import Slices
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 REGION = Interval([8.0, 5.0, 0.6, 0.2], [20.0, 25.0, 4.0, 5.0])
 
 

@@ -11,8 +11,6 @@ from scipy.optimize import linprog
 import gsisio_jax as gx
 from gsisio_jax import Interval, Status
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 TURN = 0.95 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
 C = np.array([[1.0, 0], [0, 1], [1, 1]])
 G = np.array([[1.0], [0.5]])

@@ -15,8 +15,6 @@ from gsisio_jax import Interval
 from gsisio_jax.observer.residuals import window_residual
 from gsisio_jax.observer.window import Window
 
-pytestmark = pytest.mark.usefixtures("uncompiled")
-
 ANGLE = 0.3
 TURN = 0.95 * np.array([[np.cos(ANGLE), -np.sin(ANGLE)], [np.sin(ANGLE), np.cos(ANGLE)]])
 W, V, START = np.array([0.02, 0.02]), np.array([0.05, 2.0]), np.array([3.0, 3.0])

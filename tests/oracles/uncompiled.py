@@ -1,8 +1,8 @@
 """`estimate`, `start`, `step` and `resume` without XLA: the very same program, run in NumPy equation by equation.
 
-Compiling a program takes three times as long as tracing it, and tests run most programs once. What XLA makes of the
-recursion is tested where it is the question (tests/observer/test_containment.py, test_compiled.py, tests/rounding,
-studies, examples); and the first program of every module that uses this is compiled as well, and must say the same."""
+Compiling a program takes three times as long as tracing it, and tests run most programs once. So this is how all
+modules of tests run the recursion (tests/conftest.py), but those that are about what XLA makes of it (`COMPILED`);
+tests/observer/test_uncompiled.py compares both."""
 
 from __future__ import annotations
 
@@ -17,31 +17,15 @@ import numpy as np
 import pytest
 from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
+from oracles import uncompiled_calls
+from oracles.uncompiled_calls import FEW, MOST
+from oracles.uncompiled_calls import in_numpy as in_numpy
 
 from gsisio_jax.observer import estimation
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 NAMES = ("_estimate", "_start", "_step", "_resume")
-MOST = 100
-"""Longer records are compiled: a step takes NumPy some ten milliseconds."""
-
-
-def in_numpy(function: Callable[..., Any]) -> Callable[..., Any]:
-    """In place of `jax.jit` for large programs that run a few times; traced once for equal shapes."""
-    programs: dict[Any, Callable[..., Any]] = {}
-
-    def run(*args: Any) -> Any:
-        leaves, structure = jax.tree.flatten(args)
-        key = structure, tuple((np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves)
-        if key not in programs:
-            programs[key] = numpy_function(function, *args)
-        return programs[key](*args)
-
-    return run
-
-
 _programs: dict[Any, Callable[..., Any]] = {}
-_compared: list[bool] = []
 
 
 @contextmanager
@@ -51,9 +35,9 @@ def uncompiled() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in NAMES:
             patch.setattr(estimation, name, _through_numpy(getattr(estimation, name)))
+        uncompiled_calls.replaced(patch)
         yield
     _programs.clear()
-    _compared.clear()
 
 
 def _through_numpy(compiled: Callable[..., Any]) -> Callable[..., Any]:
@@ -79,6 +63,8 @@ class _Traced:
         shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
         self.closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
         self.structure = jax.tree.structure(shape)
+        kinds = [v.aval.shape == () for eqn in _equations(self.closed.jaxpr) for v in eqn.outvars]
+        self.of_numbers = np.mean(kinds) > 0.8
 
     def mapped(self, axes: Sequence[Sequence[int | None]]) -> Callable[..., Sequence[Any]]:
         """As a function of JAX, under as many `jax.vmap` as there are axes."""
@@ -92,26 +78,31 @@ _numpy = jex.Primitive("in_numpy")
 _numpy.multiple_results = True
 
 
-def _in_numpy(*args: Any, program: _Traced, axes: Any) -> list[Any]:
+def _equations(jaxpr: Any) -> Iterator[Any]:
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for inner in (param for param in eqn.params.values() if hasattr(param, "jaxpr")):
+            yield from _equations(inner.jaxpr)
+
+
+def _values(args: Sequence[Any], program: _Traced, axes: Any) -> Sequence[Any]:
+    if axes and program.of_numbers and (count := _size(axes[-1], args)) <= FEW:
+        rows = (
+            [arg if axis is None else arg[i] for arg, axis in zip(args, axes[-1], strict=True)] for i in range(count)
+        )
+        return [np.stack(column) for column in zip(*(_values(row, program, axes[:-1]) for row in rows), strict=True)]
     key = program, axes, tuple(arg.shape for arg in args)
     if key not in _programs:
         _programs[key] = numpy_function(program.mapped(axes), *args)
-    found = [jax.numpy.asarray(value) for value in _programs[key](*args)]
-    if not _compared:
-        _compared.append(True)
-        for own, other in zip(found, jax.jit(program.mapped(axes))(*args), strict=True):
-            _same(np.asarray(own), np.asarray(other))
-    return found
+    return _programs[key](*args)
 
 
-def _same(own: np.ndarray, other: np.ndarray) -> None:
-    """Equal, but for sums that are taken in another order."""
-    assert own.dtype == other.dtype
-    if own.dtype.kind == "f":
-        eps = np.finfo(own.dtype).eps
-        np.testing.assert_allclose(own, other, rtol=2.0**13 * eps, atol=2.0**13 * eps)
-    else:
-        np.testing.assert_array_equal(own, other)
+def _size(along: Sequence[int | None], args: Sequence[Any]) -> int:
+    return next(arg.shape[0] for arg, axis in zip(args, along, strict=True) if axis == 0)
+
+
+def _in_numpy(*args: Any, program: _Traced, axes: Any) -> list[Any]:
+    return [jax.numpy.asarray(value) for value in _values([np.asarray(arg) for arg in args], program, axes)]
 
 
 def _batch(args: Any, dims: Any, *, program: _Traced, axes: Any) -> tuple[list[Any], list[int]]:

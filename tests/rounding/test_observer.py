@@ -10,6 +10,8 @@ from oracles.exact_sums import hull, product, sign
 from plants import LINEAR, QUADRATIC
 from runs import run
 
+COMPILED = True
+
 RUNS = [
     ("feedthrough of rank one", np.float64, (1.0, 1e6, 1e12)),
     ("constants", np.float32, (1.0, 1e3)),

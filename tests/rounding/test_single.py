@@ -14,6 +14,8 @@ import single_run
 import gsisio_jax as gx
 from gsisio_jax import Interval
 
+COMPILED = True
+
 
 @pytest.fixture(scope="module")
 def observer():

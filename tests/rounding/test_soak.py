@@ -7,6 +7,8 @@ import pytest
 from plants import LINEAR, linear_observer
 from soak import forms, observers, primitives, sums
 
+COMPILED = True
+
 pytestmark = pytest.mark.soak
 DTYPES = pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
 

@@ -33,6 +33,7 @@ dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 bar_module, run_module = (importlib.import_module(f"gsisio_jax.study.{name}") for name in ("bar", "run"))
 
+COMPILED = True  # other processes compile, and their bits are compared
 TILES = 8  # of 3 boxes, the last one of 1
 # A worker that dies is replaced by its nanny; the cluster must not take it for lost while a busy machine starts it.
 PATIENT = {"distributed.deploy.lost-worker-timeout": "300s", "distributed.comm.timeouts.connect": "10s"}

@@ -21,6 +21,7 @@ from gsisio_jax.study import crew, kernel
 from gsisio_jax.study.store import TileStore
 
 job_module = importlib.import_module("gsisio_jax.study.job")
+COMPILED = True  # threads share one program, whose bits are compared
 CHUNK = 4  # of 22 cases: 5 full ones and half of one
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import systems
 from gradient_points import KINDS, Checker, folded
+from oracles.uncompiled import in_numpy
 
 import gsisio_jax as gx
 from gsisio_jax.tuning import fold
@@ -30,7 +31,7 @@ TANK = systems.Case(
 @pytest.fixture(scope="module")
 def tank() -> Checker:
     # The cheapest design: the default ones are in the table of `python -m benchmarks.gradients`.
-    return Checker(TANK, POINTS, folded, sweeps=1, bounds=["affine"])
+    return Checker(TANK, POINTS, folded, in_numpy, sweeps=1, bounds=["affine"])
 
 
 def test_against_central_differences(tank):

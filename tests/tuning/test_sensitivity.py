@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from oracles.uncompiled_calls import compiled
 
 import gsisio_jax as gx
 from gsisio_jax.tuning.model import with_model
@@ -21,9 +22,11 @@ def model(theta):
 @pytest.fixture(scope="module")
 def table(axis):
     names = {"state": ["position", "speed"], "output": ["radar", "doppler"], "input": ["acceleration"]}
-    return gx.width_sensitivity(
-        axis.observer, axis.initial, axis.y[0, :ROWS], model=model, theta={"step": 0.1}, names=names
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        compiled(patch)
+        return gx.width_sensitivity(
+            axis.observer, axis.initial, axis.y[0, :ROWS], model=model, theta={"step": 0.1}, names=names
+        )
 
 
 def widths(axis, noise, observer=None):

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from oracles.noise_program import smallest_noise
+from oracles.uncompiled_calls import compiled
 
 import gsisio_jax as gx
 from gsisio_jax.tuning import Records, TunedNoise, tune_noise
@@ -42,7 +43,8 @@ def test_reaches_the_optimum_of_the_linear_program(fitted, oracle):
     assert 0.998 * oracle[0] <= fitted.lower_bound <= oracle[0] * (1 + 1e-5)
 
 
-def test_the_penalty_reaches_it_as_well(axis, oracle):
+def test_the_penalty_reaches_it_as_well(axis, oracle, monkeypatch):
+    compiled(monkeypatch)  # hundreds of gradients
     found = tune_noise(axis.observer, axis.records, weights=WEIGHTS, method="optax", iterations=200)
     assert found.method == "optax"
     assert not any("local" in note for note in found.notes)

@@ -11,7 +11,7 @@ import gsisio_jax as gx
 from gsisio_jax.tuning import Records, tune_noise
 
 # S5 at its full length of 200 steps, and S4b, are measured by `python -m benchmarks.tuning`.
-SETTINGS = {"s5": (systems.s5, 80)}
+SETTINGS = {"s5": (systems.s5, 30)}
 
 
 def simulated(case: systems.Case, count: int, truth: bool = False) -> Records:
@@ -28,9 +28,8 @@ def test_common_scale_from_twenty_records(name):
     # The template is 1.3 times the truth, so the truth is not where the search starts.
     wide = gx.Noise(*(gx.Interval(1.3 * b.lower, 1.3 * b.upper) for b in (case.noise.w, case.noise.v)))
     records = simulated(case, 20)
-    found = tune_noise(
-        case.design(missing=False).with_rounding("nearest"), records, wide, "scale", held_out=0.0, tolerance=4e-3
-    )
+    observer = case.design(missing=False, sweeps=1, window=1).with_rounding("nearest")
+    found = tune_noise(observer, records, wide, "scale", held_out=0.0, tolerance=4e-3)
     assert 0.9 <= 1.3 * found.factors["scale"] <= 1.001
     assert found.cost <= found.start_cost
 

@@ -19,11 +19,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import product
 from gsisio_jax.inclusion.rules.univariate import INF, Curve, Piece, extremes
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 PIECES = 8
 
@@ -60,8 +62,7 @@ class Turning:
             return jnp.where(finite, fn(jnp.where(finite, t, 0)), jnp.where(t < 0, *limits))
 
         found = [at(a), at(b)]
-        for point in points:
-            value = fn(jnp.asarray(point, a.dtype))
+        for point, value in zip(points, _known(fn, points, np.dtype(a.dtype)), strict=True):
             found.append(jnp.where((a <= point) & (point <= b), value, found[0]))
         if self.far < math.inf:
             for end, start in ((b, a), (-a, -b)):
@@ -88,25 +89,28 @@ class Turning:
         s = jnp.where(wide, pb - pa, self.slope(0.5 * a + 0.5 * b)) / jnp.where(wide, b - a, 1)
         usable = finite & jnp.isfinite(s)
         s = jnp.where(usable, s, 0)
-        parts = []
-        for k in range(PIECES):
-            # Ends of neighbouring pieces are the same numbers, so together they cover [a, b].
-            low = a if k == 0 else a + (b - a) * (k / PIECES)
-            high = b if k == PIECES - 1 else a + (b - a) * ((k + 1) / PIECES)
-            m = 0.5 * low + 0.5 * high
-            left = self.derivative(low, high)
-            left = Interval.unchecked(rounding.down(left.lower - s), rounding.up(left.upper - s))
-            moved = product(left, Interval.unchecked(rounding.down(low - m), rounding.up(high - m)))
-            value = self.fn(m) - s * m
-            size = abs(value) + 2 * abs(s * m) + abs(moved.lower) + abs(moved.upper) + self.size
-            parts.append(
-                (
-                    rounding.lowered(value + moved.lower, size, self.ulps + 8),
-                    rounding.raised(value + moved.upper, size, self.ulps + 8),
-                )
-            )
-        rest = Interval.unchecked(extremes([p[0] for p in parts]).lower, extremes([p[1] for p in parts]).upper)
+        # All pieces at once. Ends of neighbours are the same numbers, so together they cover [a, b].
+        ends = [a, *(a + (b - a) * (k / PIECES) for k in range(1, PIECES)), b]
+        low, high = jnp.stack(ends[:-1]), jnp.stack(ends[1:])
+        m = 0.5 * low + 0.5 * high
+        left = self.derivative(low, high)
+        left = Interval.unchecked(rounding.down(left.lower - s), rounding.up(left.upper - s))
+        moved = product(left, Interval.unchecked(rounding.down(low - m), rounding.up(high - m)))
+        value = self.fn(m) - s * m
+        size = abs(value) + 2 * abs(s * m) + abs(moved.lower) + abs(moved.upper) + self.size
+        lower = rounding.lowered(value + moved.lower, size, self.ulps + 8)
+        upper = rounding.raised(value + moved.upper, size, self.ulps + 8)
+        rest = Interval.unchecked(
+            extremes([lower[k] for k in range(PIECES)]).lower, extremes([upper[k] for k in range(PIECES)]).upper
+        )
         return s, choose(usable, rest, natural)
+
+
+@functools.cache
+def _known(fn: Callable[[Any], Any], points: tuple[float, ...], dtype: Any) -> np.ndarray:
+    """Values at fixed points, computed once: written out, they were most of what is traced and compiled."""
+    at = np.asarray(points, dtype)
+    return numpy_function(fn, at)(at)
 
 
 def _silu(t: Any) -> Any:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +18,7 @@ from gsisio_jax.inclusion.node import is_node
 from gsisio_jax.inclusion.rules.activations import GELU, GELU_TANH, MISH, SILU
 from gsisio_jax.inclusion.rules.makers import Makers, Match
 from gsisio_jax.inclusion.rules.univariate import apply
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 _MOST_STEPS = 24
 _BENT = {"tanh", "erf", "erfc", "logistic", "exp"}
@@ -49,8 +50,8 @@ def product(graph: Makers, eqn: Any) -> Match | None:
         if steps is None or not steps & _BENT:
             continue
         tolerance = 1e-5 if leaf.aval.dtype == np.float32 else 1e-10
-        with jax.ensure_compile_time_eval():
-            found = np.array([np.ravel(_value(graph, eqn, leaf, float(t)))[:1] for t in _POINTS], float).ravel()
+        first = numpy_function(partial(_first_value, graph, eqn, leaf), 0.0)
+        found = np.array([first(float(t)) for t in _POINTS], float)
         for curve, exact in GATES.values():
             if np.allclose(found, exact(_POINTS), tolerance, tolerance):
                 return Match(lambda x, curve=curve: apply(curve, x) if is_node(x) else None, [leaf])
@@ -94,8 +95,12 @@ def _steps(graph: Makers, eqn: Any, leaf: Any, left: list[int]) -> set[str] | No
     return names
 
 
-def _value(graph: Makers, eqn: Any, leaf: Any, t: float) -> Any:
-    """The expression at one number."""
+def _first_value(graph: Makers, eqn: Any, leaf: Any, t: Any) -> Any:
+    return _value(graph, eqn, leaf, t).ravel()[0]
+
+
+def _value(graph: Makers, eqn: Any, leaf: Any, t: Any) -> Any:
+    """The expression where all entries of the leaf are t."""
     args = []
     for atom in eqn.invars:
         aval: Any = atom.aval

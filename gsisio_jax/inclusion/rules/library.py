@@ -29,6 +29,7 @@ from gsisio_jax.inclusion.rules.order import count_below
 from gsisio_jax.inclusion.rules.tables import PiecewiseLinear, interpolation
 from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval.box import Interval, choose, entire_like
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 Rule = Callable[..., list[Any] | None]
 _TABLES: dict[Any, PiecewiseLinear | None] = {}
@@ -41,8 +42,7 @@ def _concrete(*values: Any) -> bool:
 
 def _body_at(eqn: Any, *args: Any) -> list[np.ndarray]:
     """Results of the body for concrete arguments."""
-    with jax.ensure_compile_time_eval():
-        return [np.asarray(v) for v in jex.jaxpr_as_fun(eqn.params["jaxpr"])(*args)]
+    return numpy_function(jex.jaxpr_as_fun(eqn.params["jaxpr"]), *args)(*args)
 
 
 def _sample(eqn: Any, place: int = 0) -> np.ndarray:

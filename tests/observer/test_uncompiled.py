@@ -1,0 +1,116 @@
+"""What most tests run in NumPy is what XLA computes: observers of many kinds, whole records, single steps, batches."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import systems
+import target
+from models.gallery import MODELS
+from models.runner import records
+from oracles.uncompiled import FEW, uncompiled
+
+import gsisio_jax as gx
+from gsisio_jax import Interval
+
+COMPILED = True
+
+
+def _plant(name, **options):
+    """A plant of the gallery and a record of it that loses measurements and is struck once."""
+    model = MODELS[name]()
+    options = model.design | {"sweeps": 1, "missing": False} | options
+    observer = gx.design_observer(model.system, model.noise, model.region, u_region=model.u_region, **options)
+    run = records(model)[0]
+    y = run.y[:12].copy()
+    y[4] = np.nan
+    y[9, 0] += 1e3
+    return observer, model.initial, y, run.u[:12] if model.system.m else None
+
+
+def _cart(delay=None, lost=False, **known):
+    system = gx.System(lambda x: [x[0] + 0.1 * x[1], x[1]], lambda x: x[:1], [[0.005], [0.1]], [[0.0]], **known)
+    noise = gx.Noise(Interval.symmetric([1e-3, 1e-3]), Interval.symmetric([0.1]))
+    options = {} if delay is None else {"delay": delay}
+    observer = gx.design_observer(system, noise, Interval.symmetric([5.0, 5.0]), missing=lost, **options)
+    y = np.cumsum(np.full((12, 1), 0.05), axis=0)
+    y[5] = np.nan
+    y[9] += 30
+    return observer, Interval.symmetric([1.0, 1.0]), y, None
+
+
+def _target():
+    mover = target.design()
+    y = mover.simulate(0, 1)[1][0, :12]
+    y[4, 0], y[6], y[9] = np.nan, np.nan, 1e3
+    return mover.observer, mover.initial, y, None
+
+
+def _s1(**options):
+    case = systems.s1()
+    run, _ = case.simulate(jax.random.key(0))
+    return case.design(**options), case.initial, np.asarray(run.y)[:12], None
+
+
+CASES = {
+    "one gain": _s1,
+    "two sweeps": lambda: _s1(sweeps=2),
+    "bank, window": _target,
+    "delay": lambda: _cart(delay="auto"),
+    "input in blocks": lambda: _cart(delay="auto", input_constant=3),
+    "periodic": partial(_plant, "heading"),
+    "table": partial(_plant, "battery"),
+    "arrays": partial(_plant, "network_tanh"),
+    "cells": partial(_plant, "range_only", cells=4),
+}
+
+
+def _same(own, other):
+    """Equal, but for sums that are taken in another order."""
+    for a, b in zip(jax.tree.leaves(own), jax.tree.leaves(other), strict=True):
+        a, b = np.asarray(a), np.asarray(b)
+        assert a.dtype == b.dtype
+        if a.dtype.kind == "f":
+            near = 2.0**13 * np.finfo(a.dtype).eps
+            np.testing.assert_allclose(a, b, rtol=near, atol=near)
+        else:
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_records(name):
+    observer, initial, y, u = CASES[name]()
+    compiled = gx.estimate(observer, initial, y, u)
+    assert np.asarray(compiled.status).any() or name in ("one gain", "two sweeps")
+    with uncompiled():
+        _same(gx.estimate(observer, initial, y, u), compiled)
+
+
+def test_single_precision_and_steps():
+    observer, initial, y, _ = _s1()
+    initial, y = initial.astype(np.float32), y.astype(np.float32)
+
+    def run():
+        carry, first = gx.start(observer, initial, y[0])
+        return first, gx.step(observer, carry, y[1], on_conflict="hold")
+
+    compiled = run()
+    with uncompiled():
+        _same(run(), compiled)
+
+
+@pytest.mark.parametrize("count", [3, FEW + 1])
+def test_batches(count):
+    """One by one, and as arrays."""
+    observer, initial, y, _ = _s1()
+    rows = jnp.asarray(y[:4] + np.linspace(-0.1, 0.1, count)[:, None, None])
+    boxes = Interval(*(jnp.linspace(1, 1.2, count)[:, None] * side for side in (initial.lower, initial.upper)))
+
+    def run():
+        return jax.vmap(partial(gx.estimate, observer))(boxes, rows)
+
+    compiled = run()
+    with uncompiled():
+        _same(run(), compiled)
