@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import pytest
+from oracles.uncompiled import is_about_xla
 from oracles.uncompiled import uncompiled as without_xla
 
 jax.config.update("jax_enable_x64", True)
@@ -53,7 +54,7 @@ def little_memory() -> Iterator[None]:
 @pytest.fixture(scope="module", autouse=True)
 def uncompiled(request: pytest.FixtureRequest) -> Iterator[None]:
     """What the observer says is asked without XLA, but in modules that are about what XLA makes of it (`COMPILED`)."""
-    if getattr(getattr(request.node, "obj", None), "COMPILED", False):
+    if is_about_xla(request):
         yield
     else:
         with without_xla():

@@ -247,9 +247,9 @@ def normal(lower: Any, upper: Any) -> tuple[Any, Any]:
 
 
 def _normal(x: Any, side: float) -> Any:
-    tiny = float(jnp.finfo(x.dtype).tiny)
     if isinstance(x, np.ndarray | np.generic):
         x = np.asarray(x)
+        tiny = float(np.finfo(x.dtype).tiny)
         outward_side = np.where(x * side > 0, x.dtype.type(side * tiny), x.dtype.type(0))
         return np.where((x != 0) & (np.abs(x) < tiny), outward_side, x)
     return _normal_bits(x, side)

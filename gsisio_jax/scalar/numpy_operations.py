@@ -72,7 +72,9 @@ def _jitted(primitive: Any, params: tuple[tuple[str, Any], ...]) -> Callable[...
 def operator(eqn: Any) -> str | None:
     """The operation of single numbers as Python writes it."""
     name, kinds = eqn.primitive.name, [v.aval for v in (*eqn.invars, *eqn.outvars)]
-    if any(kind.shape or _is_key(kind) for kind in kinds) or (name == "div" and kinds[0].dtype.kind != "f"):
+    if any(kind.shape or _is_key(kind) for kind in kinds):
+        return None
+    if name in _FLOATING_ONLY and kinds[0].dtype.kind != "f":
         return None
     if name == "select_n" and kinds[0].dtype != bool:
         return None

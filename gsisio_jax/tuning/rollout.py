@@ -139,7 +139,8 @@ class Scores:
         self._chosen = jax.tree.map(lambda a: a[index], self._records)
         self._room = jnp.asarray(room, dtype)
         self._dtype = dtype
-        self._small = len(records) * records.y.shape[1] <= SMALL and records.y.shape[1] <= SHORT
+        rows = records.y.shape[1]
+        self._small = len(records) * rows <= SMALL and rows <= SHORT
 
     def values(self, factors: np.ndarray) -> Score:
         """Scores of several factors (points, k), at most `POINTS`: arrays (points, R) over all records."""

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from oracles.uncompiled import is_about_xla
 from oracles.uncompiled_bounds import bounds_in_numpy
 
 from gsisio_jax.interval import rounding
@@ -22,7 +23,7 @@ def nearest():
 @pytest.fixture(scope="module", autouse=True)
 def in_numpy(request: pytest.FixtureRequest) -> Iterator[None]:
     """Bounds of boxes of numbers without XLA, but in modules that are about what XLA makes of them (`COMPILED`)."""
-    if getattr(request.module, "COMPILED", False):
+    if is_about_xla(request):
         yield
     else:
         with bounds_in_numpy():

@@ -28,6 +28,11 @@ NAMES = ("_estimate", "_start", "_step", "_resume")
 _programs: dict[Any, Callable[..., Any]] = {}
 
 
+def is_about_xla(request: pytest.FixtureRequest) -> bool:
+    """Of the module of a fixture: it says ``COMPILED = True``. Doctests have modules that say nothing."""
+    return getattr(getattr(request.node, "obj", None), "COMPILED", False)
+
+
 @contextmanager
 def uncompiled() -> Iterator[None]:
     """Within, calls are run in NumPy, also under `jax.vmap`; where they are differentiated or part of a larger program
@@ -86,7 +91,7 @@ def _equations(jaxpr: Any) -> Iterator[Any]:
 
 
 def _values(args: Sequence[Any], program: _Traced, axes: Any) -> Sequence[Any]:
-    if axes and program.of_numbers and (count := _size(axes[-1], args)) <= FEW:
+    if axes and program.of_numbers and (count := _size(axes[-1], [arg.shape for arg in args])) <= FEW:
         rows = (
             [arg if axis is None else arg[i] for arg, axis in zip(args, axes[-1], strict=True)] for i in range(count)
         )
@@ -97,8 +102,8 @@ def _values(args: Sequence[Any], program: _Traced, axes: Any) -> Sequence[Any]:
     return _programs[key](*args)
 
 
-def _size(along: Sequence[int | None], args: Sequence[Any]) -> int:
-    return next(arg.shape[0] for arg, axis in zip(args, along, strict=True) if axis == 0)
+def _size(along: Sequence[int | None], shapes: Sequence[tuple[int, ...]]) -> int:
+    return next(shape[0] for shape, axis in zip(shapes, along, strict=True) if axis == 0)
 
 
 def _in_numpy(*args: Any, program: _Traced, axes: Any) -> list[Any]:
@@ -116,7 +121,7 @@ def _types(*args: Any, program: _Traced, axes: Any) -> list[ShapedArray]:
     sizes: tuple[int, ...] = ()
     shapes = [arg.shape for arg in args]
     for along in axes[::-1]:  # the outermost first
-        sizes += (next(shape[0] for shape, axis in zip(shapes, along, strict=True) if axis == 0),)
+        sizes += (_size(along, shapes),)
         shapes = [shape[1:] if axis == 0 else shape for shape, axis in zip(shapes, along, strict=True)]
     return [ShapedArray((*sizes, *out.shape), out.dtype) for out in program.closed.out_avals]
 

@@ -60,7 +60,7 @@ def replaced(patch: pytest.MonkeyPatch) -> None:
 
     def run(fixed: Any, varying: Any, shared: Any, rows: Any, reductions: Any, hold: bool, most: int) -> Any:
         case = eqx.combine(jax.tree.map(lambda a: a[0], varying), shared)
-        if rows.steps(case) > MOST or any(len(a.devices()) > 1 for a in jax.tree.leaves(varying) if _on_device(a)):
+        if rows.steps(case) > MOST or any(_is_shared(a) for a in jax.tree.leaves(varying)):
             return by_xla(fixed, varying, shared, rows, reductions, hold, most)
         one, all_ = study(fixed, rows, reductions, hold, most)
         return _each(one, varying, shared) if _size(varying) <= FEW else all_(varying, shared)
@@ -124,5 +124,6 @@ def _dtype(leaf: Any) -> Any:
     return getattr(leaf, "dtype", None) or np.asarray(leaf).dtype
 
 
-def _on_device(array: Any) -> bool:
-    return hasattr(array, "devices")
+def _is_shared(array: Any) -> bool:
+    """By several devices."""
+    return isinstance(array, jax.Array) and len(array.devices()) > 1
