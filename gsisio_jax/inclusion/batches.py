@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.box import Interval
@@ -87,12 +88,11 @@ def batched(bounds: Callable[..., Any], shared: bool = True, chunk: int = CHUNK)
             got = f"a box of shape {boxes.shape}" if isinstance(boxes, Interval) else type(boxes).__name__
             remedy = "; for one box call the bounds themselves" if isinstance(boxes, Interval) else ""
             raise ValueError(f"inclusion.batched: needs an Interval of shape (N, n), got {got}{remedy}")
-        args = jax.tree.map(jnp.asarray, args)
         for leaf in [] if shared else jax.tree.leaves(args):
-            if leaf.shape[:1] != boxes.shape[:1]:
+            if np.shape(leaf)[:1] != boxes.shape[:1]:
                 raise ValueError(
                     f"inclusion.batched: with shared=False a further argument has {boxes.shape[0]} rows, one a box; "
-                    f"got one of shape {leaf.shape}; what holds for all boxes goes with shared=True"
+                    f"got one of shape {np.shape(leaf)}; what holds for all boxes goes with shared=True"
                 )
         return compiled(boxes, args, rounded_outward=outward())
 

@@ -26,6 +26,7 @@ from gsisio_jax.inclusion.loops import kept_loop, stack
 from gsisio_jax.inclusion.node import as_node, is_node, normalise, normalised
 from gsisio_jax.inclusion.origin import remember, settled
 from gsisio_jax.inclusion.rules import comparison, linear, patterns
+from gsisio_jax.inclusion.rules.functions import CURVES
 from gsisio_jax.inclusion.rules.indexing import TooManyPlacesError
 from gsisio_jax.inclusion.rules.library import EXACT, WHOLE
 from gsisio_jax.inclusion.rules.piecewise import by_pieces
@@ -124,7 +125,8 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
         if name in ("select_n", "mul") and is_node(value):
             value = by_pieces(eqn, args, value, _result, ELEMENTWISE)
         product = name in ("mul", "div") and all(map(is_node, args))
-        return normalise(value) if is_node(value) and (product or not value.unnormalised) else value
+        last = product or not (name in CURVES or (is_node(value) and value.unnormalised))
+        return normalise(value) if is_node(value) and last else value
     raise UnknownPrimitiveError(name)
 
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
+from flint import arb, arb_poly, ctx, fmpq
 from oracles.uncompiled import in_numpy
 
 from gsisio_jax.inclusion.atom_bounds import BoxOfAtoms
@@ -15,7 +18,7 @@ from gsisio_jax.inclusion.atom_values import rule
 from gsisio_jax.inclusion.atoms import Rows, States
 from gsisio_jax.inclusion.expansion import Expansion
 from gsisio_jax.inclusion.reader import expand
-from gsisio_jax.inclusion.rules.sincos import LIMIT, SLOT, half_sin_cos, sin_cos
+from gsisio_jax.inclusion.rules.sincos import _COSINE, _SINE, LIMIT, SLOT, half_sin_cos, sin_cos
 from gsisio_jax.inclusion.rules.trig import wave_atom, wave_point
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
@@ -278,12 +281,34 @@ def test_sines_are_as_accurate_as_stated(dtype):
         x = mp.mpf(float(x))
         assert abs(mp.sin(x) - mp.mpf(float(s))) <= eps * min(SLOT, 3 * abs(x))
         assert abs(mp.cos(x) - mp.mpf(float(c))) <= eps * SLOT
-    r = np.abs(t[np.abs(t) <= 3.2])
+    r = np.abs(t[np.abs(t) <= math.pi])
     sine, cosine = (np.asarray(v) for v in jax.jit(half_sin_cos)(r))
     for x, s, c in zip(r, sine, cosine, strict=True):
         half = mp.mpf(float(x)) / 2
         assert abs(mp.sin(half) - mp.mpf(float(s))) <= eps * min(SLOT, 3 * half)
         assert abs(mp.cos(half) - mp.mpf(float(c))) <= eps * SLOT
+
+
+@pytest.mark.parametrize("dtype", PRECISIONS)
+@pytest.mark.parametrize("cosine", [False, True])
+def test_polynomials_are_as_close_as_stated(dtype, cosine):
+    """What is left of the series after the polynomial, on every z = y^2, in balls; its tail alternates."""
+    name, terms, pieces = np.dtype(dtype).name, 12, 1000
+    given = [1, -0.5, *_COSINE[name]] if cosine else [1, *_SINE[name]]
+    given = [arb(float(dtype(c))) for c in given] + [arb(0)] * (terms - len(given))
+    before, ctx.prec = ctx.prec, 200
+    try:
+        series = [arb(fmpq((-1) ** i, math.factorial(2 * i + (not cosine)))) for i in range(terms)]
+        left = arb_poly([exact - c for exact, c in zip(series, given, strict=True)])
+        slope = left.derivative()
+        end = (arb.pi() / 4 + arb(2) ** -20) ** 2
+        tail = end**terms / math.factorial(2 * terms)
+        for k in range(pieces):
+            middle, around = end * (k + 0.5) / pieces, end * arb(0, 0.51 / pieces)
+            value = left(middle) + around * slope(middle + around)
+            assert abs(value) + tail <= (0.01 if cosine else 0.1) * float(np.finfo(dtype).eps) / 2
+    finally:
+        ctx.prec = before
 
 
 @pytest.mark.parametrize("dtype", PRECISIONS)

@@ -1,17 +1,19 @@
 """Sine and cosine in plain arithmetic, with a proven error bound: no library's accuracy has to be believed.
 
-``t = k pi/2 + y`` with the nearest integer k, then Taylor's polynomials on ``|y| <= pi/4 + 2^-20``. With u the unit
-roundoff, for ``|t| < LIMIT``:
+``t = k pi/2 + y`` with the nearest integer k, then polynomials on ``|y| <= pi/4 + 2^-20``. With u the unit roundoff,
+for ``|t| < LIMIT``:
 
 - Reduction. pi/2 = P1 + P2 + P3 + rest with so few bits in P1 and P2 that ``k P1`` and ``k P2`` are exact; ``t - k P1``
   is then exact too (Sterbenz; k = 0 needs no subtraction). Two more subtractions round by ``u (|y| + 2^-20)`` each,
-  ``k P3`` by ``u k P3``, and the rest of pi/2 is below ``2^-122`` (float32: ``2^-49``) times k: y is off by ``2 u``.
-  For k = 0 nothing is subtracted: y = t.
-- Truncation. The series alternate with falling terms, so each errs by less than its first missing term: ``y^17 / 17!``
-  and ``y^18 / 18!`` (float32: ``y^11 / 11!`` and ``y^12 / 12!``), at most ``0.55 u`` (float32: ``0.1 u``), relative to
-  ``|y|`` for the sine.
-- Evaluation. ``y + y z p`` with ``|z p| < 0.11`` and ``1 - z / 2 + z^2 q`` with ``|z^2 q| < 0.016``: one rounding of
-  the result, and one or two of terms that are an eighth of it or less, in any contraction: ``1.5 u``.
+  ``k P3`` by ``u k P3``, and the rest of pi/2 is below ``2^-122`` (float32: ``2^-49``) times k: y is off by
+  ``2 u (|y| + 2^-19)``. For k = 0 nothing is subtracted: y = t.
+- Truncation. The polynomials are the best of their degree (found by exchange, in 60 digits), with coefficients rounded
+  to the type. ``|sin y - S(y)| <= .1 u |y|`` and ``|cos y - C(y)| <= .01 u`` are proven by ball arithmetic
+  (`tests/inclusion/test_expansion.py`).
+- Evaluation, in any contraction. ``y + y z p`` with ``|z p| < 0.1``: a rounding of the result, and four of terms that
+  are a tenth of it. ``1 + w``, ``w = z (-1/2 + z q)`` in [-.3, 0]: half a u for the result, which is below 1, and three
+  roundings of w. With truncation, the sine is off by ``1.6 u`` of its value, and by ``.9 u``, as it is below .71;
+  the cosine by ``1.5 u``.
 
 Together ``4 u = 2 eps`` absolutely, and ``3 eps |t|`` for the sine (k = 0: relative; else ``|t| > 0.78``).
 Only the contraction of ``a b + c`` and nothing else may be rearranged, which holds without fast-math.
@@ -41,7 +43,21 @@ _PARTS = {
     "float64": (1.57079632673412561417e00, 6.07710050630396597660e-11, 2.02226624879595063154e-21),
     "float32": (1.5703125, 4.83751296997070312500e-04, 7.54978995489188216340e-08),
 }
-_TERMS = {"float64": 7, "float32": 4}
+# Coefficients of z, z^2, ... in S(y) / y - 1, and of z^2, z^3, ... in C(y) - 1 + z / 2, where z = y^2.
+_SINE = {
+    "float64": (
+        -0.16666666666666632, 0.008333333333322425, -0.00019841269829816853, 2.755731369519055e-06,
+        -2.505075864732619e-08, 1.589682756772613e-10,
+    ),
+    "float32": (-0.16666655242443085, 0.008332177996635437, -0.00019517297914717346),
+}  # fmt: skip
+_COSINE = {
+    "float64": (
+        0.0416666666666666, -0.0013888888888874138, 2.4801587289491763e-05, -2.7557314355219067e-07,
+        2.0875723680832977e-09, -1.135966965791945e-11,
+    ),
+    "float32": (0.04166664555668831, -0.001388736767694354, 2.443845005473122e-05),
+}  # fmt: skip
 
 
 def sin_cos(t: Any) -> tuple[Any, Any]:
@@ -65,10 +81,11 @@ _falling = elementwise(
 
 
 def half_sin_cos(r: Any) -> tuple[Any, Any]:
-    """Sine and cosine of ``r / 2`` for ``0 <= r <= 3.2``, with the same error bounds.
+    """Sine and cosine of ``r / 2`` for ``0 <= r <= pi``, with the same error bounds.
 
-    From a quarter of r, which needs no reduction: ``sin = 2 s c`` is off by ``(1.5 + 1.5 + 1) u`` of its value, and
-    ``cos = 1 - 2 s^2`` by ``2 s^2 (2 1.5 + 1) u`` and a rounding of what is left, at most ``4 u`` where s^2 = 1/2.
+    From a quarter of r, which needs no reduction: ``sin = 2 s c`` is off by ``2 (.71 .9 + .71 1.5) u`` and half a u for
+    its rounding, and by ``(1.6 + 1.5 / .7 + 1) u`` of its value; ``cos = 1 - 2 s^2`` by ``4 .71 .9 u``, and half a u
+    for the product.
     """
     kind = np.dtype(r.dtype).type
     sine, cosine = _polynomials(jax.lax.stop_gradient(r) * kind(0.25))
@@ -80,11 +97,10 @@ def half_sin_cos(r: Any) -> tuple[Any, Any]:
 def _polynomials(y: Any) -> tuple[Any, Any]:
     """Sine and cosine for ``|y| <= pi/4 + 2^-20``."""
     kind = np.dtype(y.dtype).type
-    z = y * y
-    p = q = None
-    for i in range(_TERMS[_name(y)], 0, -1):
-        s, c = kind((-1) ** i / math.factorial(2 * i + 1)), kind((-1) ** (i + 1) / math.factorial(2 * i + 2))
-        p, q = (s, c) if p is None else (s + z * p, c + z * q)
+    z, name = y * y, _name(y)
+    p, q = kind(_SINE[name][-1]), kind(_COSINE[name][-1])
+    for s, c in zip(_SINE[name][-2::-1], _COSINE[name][-2::-1], strict=True):
+        p, q = kind(s) + z * p, kind(c) + z * q
     return y + y * (z * p), 1 + z * (kind(-0.5) + z * q)
 
 

@@ -44,16 +44,19 @@ _PLAIN = (-1.0, 0.0, 0.25, 1.0, 2.0)  # limits of functions that are numbers of 
 
 
 def apply(curve: Any, x: Node) -> Node:
-    """Apply a function of one variable to a node, in all domains."""
-    x = normalised(x)
+    """Apply a function of one variable to a node, in all domains. The result needs no `normalise`."""
+    wave = isinstance(curve, Wave)  # whatever comes in, NaN too, no bound of a wave is NaN: these are not looked at
+    if not wave or x.form is not None:
+        x = normalised(x)
     a, b = x.range.lower, x.range.upper
     if getattr(curve, "steep", False):
         a, b = calm(a), calm(b)
-    if isinstance(curve, Wave) and POINT_MODE.get():
+    if wave and POINT_MODE.get():
         return Node(computed_once(curve.near(a, b)))
     # What range, line and derivative of a wave have in common is computed once.
-    shared = (curve.parts(a, b),) if isinstance(curve, Wave) else ()
-    natural = computed_once(guard(curve.range(a, b, *shared)))
+    shared = (curve.parts(a, b),) if wave else ()
+    natural = curve.range(a, b, *shared)
+    natural = computed_once(natural if wave else guard(natural))
     form = None
     if x.form is not None and not POINT_MODE.get():
         s, rest = curve.line(a, b, natural, *shared)
@@ -68,7 +71,11 @@ def apply(curve: Any, x: Node) -> Node:
             slack = scaled_slack(s, x.form.slope, slope, x.form.slack)
             size = slope_magnitude(slope, x.form.box)
         form = best_form(slope, computed_once(Interval.unchecked(lower, upper)), natural, x.form.box, slack, size)
-    return Node(natural, form, None if x.jac is None else chain(guard(curve.derivative(a, b, *shared)), x.jac))
+    if x.jac is None:
+        return Node(natural, form)
+    derivative = curve.derivative(a, b, *shared)
+    jac = chain(derivative if wave else guard(derivative), x.jac)
+    return Node(natural, form, None if jac is None else guard(jac))
 
 
 def calm(t: Any) -> Any:
