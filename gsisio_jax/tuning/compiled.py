@@ -15,8 +15,8 @@ QUICK: dict[str, Any] = {
 }
 
 
-def quickly(function: Callable[..., Any]) -> Callable[..., Any]:
+def quickly(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """`jax.jit`, for a program whose compilation costs more than its run; on CPU only, elsewhere as usual."""
     if jax.default_backend() != "cpu":
-        return jax.jit(function)
-    return jax.jit(function, compiler_options=QUICK)
+        return jax.jit(function, **options)
+    return jax.jit(function, compiler_options=QUICK, **options)

@@ -11,6 +11,7 @@ import numpy as np
 
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import scan
+from gsisio_jax.observer.fixed import Fixed, chosen, fixed
 from gsisio_jax.observer.types import Observer, cast
 from gsisio_jax.plant.periodic import nearest
 from gsisio_jax.tuning.compiled import quickly
@@ -84,7 +85,9 @@ def _slack(box: Interval, value: Any, room: Any) -> Any:
     return jnp.where(jnp.isfinite(slack), slack, jnp.inf).min(initial=jnp.inf)
 
 
-def _values(observer: Observer, noise: Any, records: Any, room: Any) -> Score:
+def _values(static: Fixed | None, traced: Any, noise: Any, records: Any, room: Any) -> Score:
+    observer = chosen(static, traced)
+
     def one(noise: Any) -> Score:
         return jax.vmap(lambda record: score_record(observer, noise, record, room))(records)
 
@@ -101,8 +104,9 @@ def _gradient(observer: Observer, noise: Any, record: Any, room: Any, mix: Any) 
     return jax.value_and_grad(one, has_aux=True)(noise)
 
 
-def _gradients(observer: Observer, noise: Any, records: Any, room: Any, mix: Any) -> Any:
+def _gradients(static: Fixed | None, traced: Any, noise: Any, records: Any, room: Any, mix: Any) -> Any:
     """Record by record."""
+    observer = chosen(static, traced)
     return jax.vmap(lambda record: _gradient(observer, noise, record, room, mix))(records)
 
 
@@ -114,7 +118,8 @@ SMALL, SHORT = 5000, 400
 @cache
 def _program(gradients: bool, small: bool) -> Any:
     function = _gradients if gradients else _values
-    return quickly(function) if small else jax.jit(function)
+    # The observer's numbers are constants: the program is less than half as long.
+    return (quickly if small else jax.jit)(function, static_argnames="static")
 
 
 class Scores:
@@ -148,7 +153,7 @@ class Scores:
         full = np.concatenate([factors, np.repeat(factors[-1:], POINTS - points, axis=0)])
         # The compiled programs know bounds, not factors: another parametrisation compiles nothing.
         program = _program(False, self._small)
-        score = program(self._observer, self.shape.noise(full).astype(self._dtype), self._records, self._room)
+        score = program(*fixed(self._observer), self.shape.noise(full).astype(self._dtype), self._records, self._room)
         self.calls += points
         return Score(*(np.asarray(a)[:points] for a in score))
 
@@ -160,6 +165,6 @@ class Scores:
         """Of the penalties, or of the first violations, of the fitted records: (R,), (R, k), and the scores."""
         noise = self.shape.noise(factors).astype(self._dtype)
         program = _program(True, self._small)
-        (value, score), slope = program(self._observer, noise, self._chosen, self._room, jnp.asarray(penalty))
+        (value, score), slope = program(*fixed(self._observer), noise, self._chosen, self._room, jnp.asarray(penalty))
         self.calls += 1
         return np.asarray(value), self.shape.pull(slope), Score(*map(np.asarray, score))

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +14,7 @@ import jax
 import numpy as np
 import pytest
 
+from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.study import kernel
 from gsisio_jax.tuning import rollout, sensitivity
@@ -84,24 +85,27 @@ def _study(fixed: Any, rows: Any, reductions: Any, hold: bool, most: int) -> tup
 
 
 def _values() -> Callable[..., Any]:
-    one, many = in_numpy(rollout.score_record), in_numpy(rollout._values)
+    @cache
+    def of(static: Fixed) -> tuple[Callable[..., Any], ...]:
+        return in_numpy(partial(rollout.score_record, static.value)), in_numpy(partial(rollout._values, static, None))
 
-    def run(observer: Any, noise: Any, records: Any, room: Any) -> Any:
+    def run(static: Fixed, traced: None, noise: Any, records: Any, room: Any) -> Any:
+        one, many = of(static)
         noise = jax.tree.map(np.asarray, noise)
         flat = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in jax.tree.leaves(noise)], axis=1)
         _, first, back = np.unique(flat, axis=0, return_index=True, return_inverse=True)  # the last one is repeated
         if len(first) * _size(records) > FEW:
-            return many(observer, noise, records, room)
-        found = [_each(lambda record, i=i: one(observer, _row(noise, i), record, room), records) for i in first]
+            return many(noise, records, room)
+        found = [_each(lambda record, i=i: one(_row(noise, i), record, room), records) for i in first]
         return jax.tree.map(lambda *leaves: np.stack(leaves)[back.reshape(-1)], *found)
 
     return run
 
 
 def _gradients() -> Callable[..., Any]:
-    one = in_numpy(rollout._gradient)
-    return lambda observer, noise, records, room, mix: _each(
-        lambda record: one(observer, noise, record, room, mix), records
+    one = cache(lambda static: in_numpy(partial(rollout._gradient, static.value)))
+    return lambda static, traced, noise, records, room, mix: _each(
+        lambda record: one(static)(noise, record, room, mix), records
     )
 
 
