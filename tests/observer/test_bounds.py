@@ -1,7 +1,5 @@
 """Input bounds, noise that changes, known inputs, ragged records, hostile numbers, bad arguments."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +12,6 @@ ROUNDING = 1e-9
 STEPS, BATCH = 30, 8
 
 
-@partial(jax.jit, static_argnames="on_conflict")
 def batch(observer, initial, y, u, noise, length, on_conflict="restart"):
     def run(initial, y, u, noise, length):
         return gx.estimate(observer, initial, y, u, noise, on_conflict, length)
