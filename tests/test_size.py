@@ -11,9 +11,9 @@ import sizes
 MOST_S1 = 3500
 """Equations of a step of the paper's example, rounded outward."""
 
-SOLVER = 1.005
+SOLVER = 1.005, 4
 """Which entries of a gain are zero or one, and cost nothing, depends on the last digits of its solver: another version
-of it, or another processor, may need an equation more."""
+of it, or another processor, may need a few equations more. Relative and absolute."""
 
 step = cache(sizes.Step)
 
@@ -25,7 +25,7 @@ def test_no_stage_outgrows_its_budget(name: str, variant: str) -> None:
     grown = [
         f"{name} {variant}, stage {stage}: {count} equations, budget {budget.get(stage, 0)}"
         for stage, count in step(name).equations(variant).items()
-        if count > SOLVER * budget.get(stage, 0)
+        if count > SOLVER[0] * budget.get(stage, 0) + SOLVER[1]
     ]
     assert not grown, "; ".join(grown)
 
