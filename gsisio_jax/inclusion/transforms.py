@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.inclusion.form_arithmetic import box_sum, guard, is_known, is_point, product, slope_image, sum_slack
 from gsisio_jax.inclusion.interpreter import evaluate
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node, is_node, jac_of, slack_of, slope_of
+from gsisio_jax.inclusion.origin import UndecidedError, numbers_are_known
 from gsisio_jax.interval.box import Interval, choose
+from gsisio_jax.interval.cast import as_array
 from gsisio_jax.interval.primitives import add_up
 from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
+from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.traced import refuse_change, refuse_trace
 from gsisio_jax.tracing import explained
 
@@ -76,10 +81,10 @@ def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("natural", box, args)
         if not is_point(box):
-            return _run(f, Node(box), args, _finish_range)
+            return _run(f, box, Node, args, lambda node, _: _finish_range(node))
         token = POINT_MODE.set(True)
         try:
-            return _run(f, _variable(box), args, _finish_range)
+            return _run(f, box, _variable, args, lambda node, _: _finish_range(node))
         finally:
             POINT_MODE.reset(token)
 
@@ -103,7 +108,7 @@ def affine(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[
     @rounded_by("inclusion.affine", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("affine", box, args)
-        return _run(f, _variable(box), args, lambda node: _finish_affine(node, box))
+        return _run(f, box, _variable, args, _finish_affine)
 
     return bounds
 
@@ -126,7 +131,7 @@ def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callabl
     @rounded_by("inclusion.jacobian", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("jacobian", box, args)
-        return _run(f, _variable(box, derivative=True), args, lambda node: _finish_jacobian(node, box))
+        return _run(f, box, partial(_variable, derivative=True), args, _finish_jacobian)
 
     return bounds
 
@@ -182,7 +187,13 @@ def _variable(box: Interval, derivative: bool = False) -> Node:
     return Node(box, Form(eye, Interval.unchecked(zero, zero), InputBox.of(box)), jac)
 
 
-def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable[[Any], Any]) -> Any:
+def _run(
+    f: Callable[..., Any],
+    box: Interval,
+    start: Callable[[Interval], Node],
+    args: tuple[Any, ...],
+    finish: Callable[[Node, Interval], Any],
+) -> Any:
     """Trace f on shapes alone, interpret what comes out, and give the results f's own structure."""
 
     def is_box(value: Any) -> bool:
@@ -190,21 +201,44 @@ def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable
 
     def convert(arg: Any) -> Any:
         if is_box(arg):
-            return Node(arg.astype(x.dtype))
-        arg = jnp.asarray(arg)
-        return arg.astype(x.dtype) if jnp.issubdtype(arg.dtype, jnp.floating) else arg
+            return arg.astype(box.lower.dtype)
+        arg = as_array(arg) if isinstance(arg, np.ndarray | np.generic) else jnp.asarray(arg)
+        return arg.astype(box.lower.dtype) if jnp.issubdtype(arg.dtype, jnp.floating) else arg
 
     values = jax.tree.map(convert, args, is_leaf=is_box)
-    shapes = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), values, is_leaf=is_node)
+    shapes = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), values, is_leaf=is_box)
     if not callable(f):
         raise ValueError(f"inclusion: bounds are of a function of x, got {type(f).__name__}")
-    closed, out = _traced(f, jax.ShapeDtypeStruct(x.shape, x.dtype), *shapes)
-    _check_results(closed, x.shape)
-    inputs = [x, *jax.tree.leaves(values, is_leaf=is_node)]
-    results = evaluate(closed.jaxpr, closed.consts, inputs)
-    nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
-    nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
-    return jax.tree.unflatten(jax.tree.structure(out), [finish(_in_type(node, x.dtype)) for node in nodes])
+    closed, out = _traced(f, jax.ShapeDtypeStruct(box.shape, box.lower.dtype), *shapes)
+    _check_results(closed, box.shape)
+    given = jax.tree.leaves(values, is_leaf=is_box)
+
+    def found(box: Interval, *boxes: Interval) -> list[Any]:
+        x, rest = start(box), iter(boxes)
+        inputs = [x, *(Node(next(rest)) if is_box(value) else value for value in given)]
+        results = evaluate(closed.jaxpr, closed.consts, inputs)
+        nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
+        nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
+        return [finish(_in_type(node, x.dtype), box) for node in nodes]
+
+    boxes = [box, *filter(is_box, given)]
+    looked_at = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((boxes, given, closed.consts)))
+    return jax.tree.unflatten(jax.tree.structure(out), _in_numpy(found, boxes) if looked_at else found(*boxes))
+
+
+def _in_numpy(function: Callable[..., Any], boxes: Sequence[Interval]) -> Any:
+    """A function of boxes whose numbers are known. JAX would compile a program for every operation and every shape."""
+    sides = [(box.lower,) if is_point(box) else (box.lower, box.upper) for box in boxes]
+
+    def of_sides(*sides: Any) -> Any:
+        return function(*(Interval.unchecked(side[0], side[-1]) for side in sides))
+
+    try:
+        with numbers_are_known():
+            program = numpy_function(of_sides, *sides)
+    except UndecidedError:  # what f does depends on the numbers themselves
+        return function(*boxes)
+    return jax.tree.map(as_array, program(*sides))
 
 
 def _traced(f: Callable[..., Any], x: Any, *args: Any) -> tuple[Any, Any]:
@@ -300,14 +334,14 @@ def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("affine", box, args)
 
-        def finish(node: Node) -> tuple[AffineForm, Any]:
+        def finish(node: Node, box: Interval) -> tuple[AffineForm, Any]:
             slope = slope_of(node, InputBox.of(box))
             slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
             good, bounds = jnp.isfinite(add_up(abs(slope))), guard(node.range)
             slope, slack = (jnp.where(good[..., None], v, 0) for v in (slope, slack))
             return AffineForm(slope, choose(good, guard(node.offset), bounds), bounds), slack
 
-        return _run(f, _variable(box), args, finish)
+        return _run(f, box, _variable, args, finish)
 
     return bounds
 

@@ -18,7 +18,7 @@ from jax.core import Tracer
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.cast import cast_down, cast_towards, cast_up
+from gsisio_jax.interval.cast import cast_down, cast_known, cast_up
 from gsisio_jax.interval.minmax import cut, larger, raised, smaller
 from gsisio_jax.interval.primitives import fusion_barrier
 from gsisio_jax.interval.reading import check_type, read_array
@@ -234,7 +234,7 @@ def _representable(value: Any, towards: float) -> Any:
     dtype = jax.dtypes.canonicalize_dtype(value.dtype)
     if isinstance(value, jax.Array) or value.dtype == dtype:
         return value
-    return np.asarray(cast_towards(value, dtype, towards))
+    return cast_known(value, dtype, towards)
 
 
 def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
