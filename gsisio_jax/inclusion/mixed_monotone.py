@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax._calls import named_arguments
+from gsisio_jax.inclusion.known_boxes import by_numpy
 from gsisio_jax.inclusion.pointwise import Rows, check_derivative, room
 from gsisio_jax.inclusion.transforms import AffineForm, affine
 from gsisio_jax.interval.box import Interval
@@ -165,6 +166,7 @@ def decomposition(
     check_derivative("decomposition", derivative)
 
     @rounded_by("inclusion.decomposition", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("decomposition", f, box, args)
         a, b = rows.derivative(derivative)
@@ -193,6 +195,7 @@ def remainder(f: Callable[..., Any], derivative: Any = None, rounding: Rounding 
     check_derivative("remainder", derivative)
 
     @rounded_by("inclusion.remainder", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("remainder", f, box, args)
         n = rows.box.lower.shape[0]
@@ -236,6 +239,7 @@ def tight(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | No
     check_derivative("tight", derivative)
 
     @rounded_by("inclusion.tight", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("tight", f, box, args)
         a, b = rows.derivative(derivative)

@@ -7,18 +7,16 @@ function is being traced; nodes that come out of loops, or straight from an argu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Callable, Container, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import is_known
+from gsisio_jax.inclusion.known_boxes import case_is_open
 from gsisio_jax.inclusion.node import Node, is_node, normalised
 from gsisio_jax.interval.box import is_concrete
 
-_NUMBERS_KNOWN: ContextVar[bool] = ContextVar("gsisio_jax_numbers_known", default=False)
 MOST_OPERATIONS = 200  # that one evaluation once more may cost
 
 
@@ -170,26 +168,11 @@ class Again:
         return alike and self.allowed is not None and found.name in self.allowed
 
 
-class UndecidedError(Exception):
-    """A case could be chosen, were the function evaluated on the numbers themselves."""
-
-
-@contextmanager
-def numbers_are_known() -> Iterator[None]:
-    """What follows is traced although the box is known: whoever would choose a case by it gets an `UndecidedError`."""
-    token = _NUMBERS_KNOWN.set(True)
-    try:
-        yield
-    finally:
-        _NUMBERS_KNOWN.reset(token)
-
-
 def decided(which: Any) -> int | None:
     """The case that a selection takes everywhere, where that is known while tracing."""
     sides = (which.range.lower, which.range.upper) if is_node(which) else (which,)
     if not all(is_concrete(side) for side in sides):
-        if _NUMBERS_KNOWN.get():
-            raise UndecidedError
+        case_is_open()
         return None
     cases = np.unique(np.stack([np.asarray(side) for side in sides]))
     return int(cases[0]) if cases.size == 1 else None

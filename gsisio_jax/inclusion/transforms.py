@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,19 +12,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.inclusion.form_arithmetic import box_sum, guard, is_known, is_point, product, slope_image, sum_slack
 from gsisio_jax.inclusion.interpreter import evaluate
+from gsisio_jax.inclusion.known_boxes import by_numpy, in_numpy
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node, is_node, jac_of, slack_of, slope_of
-from gsisio_jax.inclusion.origin import UndecidedError, numbers_are_known
 from gsisio_jax.interval.box import Interval, choose
 from gsisio_jax.interval.cast import as_array
 from gsisio_jax.interval.primitives import add_up
 from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
-from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.traced import refuse_change, refuse_trace
 from gsisio_jax.tracing import explained
 
@@ -50,8 +48,11 @@ class AffineForm(eqx.Module):
         """Bounds of f on a box inside X, from slope and offset alone; shape (*out)."""
         if not isinstance(box, Interval):
             raise ValueError(f"AffineForm.over: `box` must be an Interval of shape (n,), got {type(box).__name__}")
-        slope = jnp.moveaxis(jnp.asarray(self.slope), -1, 0)
-        return guard(box_sum(slope_image(slope, box.astype(slope.dtype)), self.offset))
+        return in_numpy(partial(_over, self), box.astype(jnp.result_type(self.slope)), self)
+
+
+def _over(form: AffineForm, box: Interval) -> Interval:
+    return guard(box_sum(slope_image(jnp.moveaxis(jnp.asarray(form.slope), -1, 0), box), form.offset))
 
 
 @named_arguments
@@ -145,6 +146,7 @@ def mean_value(f: Callable[..., Any], rounding: Rounding | None = None) -> Calla
     at, slope = natural(f), jacobian(f)
 
     @rounded_by("inclusion.mean_value", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("mean_value", box, args)
         center = box.center
@@ -213,32 +215,15 @@ def _run(
     _check_results(closed, box.shape)
     given = jax.tree.leaves(values, is_leaf=is_box)
 
-    def found(box: Interval, *boxes: Interval) -> list[Any]:
-        x, rest = start(box), iter(boxes)
-        inputs = [x, *(Node(next(rest)) if is_box(value) else value for value in given)]
+    def found(box: Interval) -> list[Any]:
+        x = start(box)
+        inputs = [x, *(Node(value) if is_box(value) else value for value in given)]
         results = evaluate(closed.jaxpr, closed.consts, inputs)
         nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
         nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
         return [finish(_in_type(node, x.dtype), box) for node in nodes]
 
-    boxes = [box, *filter(is_box, given)]
-    looked_at = not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((boxes, given, closed.consts)))
-    return jax.tree.unflatten(jax.tree.structure(out), _in_numpy(found, boxes) if looked_at else found(*boxes))
-
-
-def _in_numpy(function: Callable[..., Any], boxes: Sequence[Interval]) -> Any:
-    """A function of boxes whose numbers are known. JAX would compile a program for every operation and every shape."""
-    sides = [(box.lower,) if is_point(box) else (box.lower, box.upper) for box in boxes]
-
-    def of_sides(*sides: Any) -> Any:
-        return function(*(Interval.unchecked(side[0], side[-1]) for side in sides))
-
-    try:
-        with numbers_are_known():
-            program = numpy_function(of_sides, *sides)
-    except UndecidedError:  # what f does depends on the numbers themselves
-        return function(*boxes)
-    return jax.tree.map(as_array, program(*sides))
+    return jax.tree.unflatten(jax.tree.structure(out), in_numpy(found, box, (given, closed.consts)))
 
 
 def _traced(f: Callable[..., Any], x: Any, *args: Any) -> tuple[Any, Any]:
