@@ -250,7 +250,7 @@ def cast(tree: Any, dtype: Any) -> Any:
         kind = None if jnp.issubdtype(jnp.result_type(leaf), jnp.bool_) else dtype
         if not is_concrete(leaf):
             return jnp.asarray(leaf, kind)
-        unchanged = isinstance(leaf, jax.Array) and kind in (None, leaf.dtype) and not leaf.weak_type
+        unchanged = isinstance(leaf, jax.Array) and (kind is None or leaf.dtype == kind) and not leaf.weak_type
         return leaf if unchanged else as_array(np.asarray(leaf), kind)  # JAX would compile a cast for every shape
 
     return jax.tree.map(
