@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -54,7 +55,11 @@ def decomposition_gain(derivative: Interval) -> Any:
     Source: paper, (eq:decompconstruct); theory 9.
     """
     check_type("decomposition_gain", "derivative", derivative, Interval, "inclusion.jacobian(f)(box) is one")
-    a, b = derivative.lower, derivative.upper
+    return _gain(derivative.lower, derivative.upper)
+
+
+@partial(jax.jit, inline=True)  # one program instead of one for each operation
+def _gain(a: Any, b: Any) -> Any:
     return jnp.where((a >= 0) | (b <= 0), 0, jnp.where(-a <= b, -a, b))
 
 
@@ -75,8 +80,12 @@ def width_gain(derivative: Interval) -> Any:
     Source: theory 2.11 (the paper's Lemma 2 has one constant for all rows).
     """
     check_type("width_gain", "derivative", derivative, Interval, "inclusion.jacobian(f)(box) is one")
-    a, b = derivative.lower, derivative.upper
-    return jnp.maximum(jnp.abs(a), jnp.abs(b)) + 2 * decomposition_gain(derivative)
+    return _width_gain(derivative.lower, derivative.upper)
+
+
+@partial(jax.jit, inline=True)
+def _width_gain(a: Any, b: Any) -> Any:
+    return jnp.maximum(jnp.abs(a), jnp.abs(b)) + 2 * _gain(a, b)
 
 
 @named_arguments
