@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -40,16 +41,19 @@ class Case:
         """One run from a random point of the initial box (its faces and corners included). In half of the runs the
         noise lies on the vertices of its box at every step, in the others anywhere in it."""
         noise = noise or self.noise
-        key_x, key_s, key_d, key_w, key_v, key_kind = jax.random.split(key, 6)
-        share = jnp.clip(jax.random.uniform(key_x, (self.system.n,), minval=-0.2, maxval=1.2), 0, 1)
-        x0 = self.initial.lower + share * self.initial.width
+        key_s, key_d, x0, w, v = _draws(self.steps, key, self.initial, noise.w, noise.v)
         d = d_scale * self.d(key_d, self.steps)
-        at_vertices = jax.random.bernoulli(key_kind)
-        drawn = gx.Noise(
-            _maybe_vertices(at_vertices, key_w, noise.w, self.steps),
-            _maybe_vertices(at_vertices, key_v, noise.v, self.steps),
-        )
-        return gx.simulate(self.system, key_s, x0, d, drawn, jnp.asarray(self.u(self.steps))), d
+        return gx.simulate(self.system, key_s, x0, d, gx.Noise(w, v), self.u(self.steps)), d
+
+
+@partial(jax.jit, static_argnums=0)
+def _draws(steps: int, key: Any, initial: Interval, w: Interval, v: Interval) -> tuple[Any, ...]:
+    """Two keys, a point of the initial box, and boxes of the noise: one program instead of twenty."""
+    key_x, key_s, key_d, key_w, key_v, key_kind = jax.random.split(key, 6)
+    share = jnp.clip(jax.random.uniform(key_x, initial.shape, minval=-0.2, maxval=1.2), 0, 1)
+    at_vertices = jax.random.bernoulli(key_kind)
+    noise = (_maybe_vertices(at_vertices, key, box, steps) for key, box in ((key_w, w), (key_v, v)))
+    return key_s, key_d, initial.lower + share * initial.width, *noise
 
 
 def _maybe_vertices(chosen: Any, key: Any, box: Interval, steps: int) -> Interval:

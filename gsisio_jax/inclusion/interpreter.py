@@ -101,6 +101,19 @@ def _watched(eqn: Any, args: Sequence[Any]) -> Any:
         _PLACES.reset(token)
 
 
+def _unwatched(turn: Callable[..., Any]) -> Callable[..., Any]:
+    """The turn of a loop that stays one: its numbers are none outside of it. Watched is the loop as a whole."""
+
+    def run(*args: Any) -> Any:
+        token = WATCH.set(None)
+        try:
+            return turn(*args)
+        finally:
+            WATCH.reset(token)
+
+    return run
+
+
 def _recognised(match: Any, operands: Sequence[Any]) -> Any:
     """The value of an equation that ends a known expression of these operands; None where it ends none."""
     value = match.rule(*map(normalised, operands)) if any(map(is_node, operands)) else None
@@ -215,7 +228,7 @@ def _scan(eqn: Any, *args: Any) -> Any:
         return list(out[:n_carry]), list(out[n_carry:])
 
     if length > _UNROLL or (length > 1 and length * numbers_in(body.jaxpr) > _UNROLLED_NUMBERS):
-        return kept_loop(turn, carry, xs, length, reverse)
+        return kept_loop(_unwatched(turn), carry, xs, length, reverse)
     stacked: list[Any] = [None] * length
     for i in range(length)[::-1] if reverse else range(length):
         carry, stacked[i] = turn(carry, [linear.move(lambda v, i=i: v[i], x) for x in xs])
@@ -224,7 +237,7 @@ def _scan(eqn: Any, *args: Any) -> Any:
 
 def _while(eqn: Any, *args: Any) -> list[Any]:
     def loop(turn: Callable[..., list[Any]], carry: list[Any], count: int) -> list[Any]:
-        return kept_loop(lambda carry, rows: (turn(carry), []), list(carry), [], count, False)
+        return kept_loop(_unwatched(lambda carry, rows: (turn(carry), [])), list(carry), [], count, False)
 
     def longest(body: Any) -> int:
         return min(_UNROLL, max(1, _UNROLLED_NUMBERS // max(numbers_in(body), 1)))

@@ -12,6 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from gsisio_jax._calls import named_arguments
+from gsisio_jax.inclusion.known_boxes import by_numpy
 from gsisio_jax.inclusion.mixed_monotone import decomposition, remainder
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.inclusion.transforms import AffineForm, affine, distance, jacobian, mean_value, natural
@@ -78,6 +79,7 @@ def bound(
     }
 
     @rounded_by("inclusion.bound", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> AffineForm:
         form, ranges = None, []
         if "affine" in chosen:

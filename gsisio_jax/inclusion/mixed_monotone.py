@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import jax
@@ -26,6 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax._calls import named_arguments
+from gsisio_jax.inclusion.known_boxes import by_numpy
 from gsisio_jax.inclusion.pointwise import Rows, check_derivative, room
 from gsisio_jax.inclusion.transforms import AffineForm, affine
 from gsisio_jax.interval.box import Interval
@@ -53,7 +55,11 @@ def decomposition_gain(derivative: Interval) -> Any:
     Source: paper, (eq:decompconstruct); theory 9.
     """
     check_type("decomposition_gain", "derivative", derivative, Interval, "inclusion.jacobian(f)(box) is one")
-    a, b = derivative.lower, derivative.upper
+    return _gain(derivative.lower, derivative.upper)
+
+
+@partial(jax.jit, inline=True)  # one program instead of one for each operation
+def _gain(a: Any, b: Any) -> Any:
     return jnp.where((a >= 0) | (b <= 0), 0, jnp.where(-a <= b, -a, b))
 
 
@@ -74,8 +80,12 @@ def width_gain(derivative: Interval) -> Any:
     Source: theory 2.11 (the paper's Lemma 2 has one constant for all rows).
     """
     check_type("width_gain", "derivative", derivative, Interval, "inclusion.jacobian(f)(box) is one")
-    a, b = derivative.lower, derivative.upper
-    return jnp.maximum(jnp.abs(a), jnp.abs(b)) + 2 * decomposition_gain(derivative)
+    return _width_gain(derivative.lower, derivative.upper)
+
+
+@partial(jax.jit, inline=True)
+def _width_gain(a: Any, b: Any) -> Any:
+    return jnp.maximum(jnp.abs(a), jnp.abs(b)) + 2 * _gain(a, b)
 
 
 @named_arguments
@@ -165,6 +175,7 @@ def decomposition(
     check_derivative("decomposition", derivative)
 
     @rounded_by("inclusion.decomposition", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("decomposition", f, box, args)
         a, b = rows.derivative(derivative)
@@ -193,6 +204,7 @@ def remainder(f: Callable[..., Any], derivative: Any = None, rounding: Rounding 
     check_derivative("remainder", derivative)
 
     @rounded_by("inclusion.remainder", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("remainder", f, box, args)
         n = rows.box.lower.shape[0]
@@ -236,6 +248,7 @@ def tight(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | No
     check_derivative("tight", derivative)
 
     @rounded_by("inclusion.tight", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> Any:
         rows = Rows("tight", f, box, args)
         a, b = rows.derivative(derivative)

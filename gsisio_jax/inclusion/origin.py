@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import is_known
+from gsisio_jax.inclusion.known_boxes import case_is_open
 from gsisio_jax.inclusion.node import Node, is_node, normalised
 from gsisio_jax.interval.box import is_concrete
 
@@ -171,6 +172,7 @@ def decided(which: Any) -> int | None:
     """The case that a selection takes everywhere, where that is known while tracing."""
     sides = (which.range.lower, which.range.upper) if is_node(which) else (which,)
     if not all(is_concrete(side) for side in sides):
+        case_is_open()
         return None
     cases = np.unique(np.stack([np.asarray(side) for side in sides]))
     return int(cases[0]) if cases.size == 1 else None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -16,8 +17,10 @@ from jaxtyping import Array, Float
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.inclusion.form_arithmetic import box_sum, guard, is_known, is_point, product, slope_image, sum_slack
 from gsisio_jax.inclusion.interpreter import evaluate
+from gsisio_jax.inclusion.known_boxes import by_numpy, in_numpy
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node, is_node, jac_of, slack_of, slope_of
 from gsisio_jax.interval.box import Interval, choose
+from gsisio_jax.interval.cast import as_array
 from gsisio_jax.interval.primitives import add_up
 from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
 from gsisio_jax.traced import refuse_change, refuse_trace
@@ -45,8 +48,11 @@ class AffineForm(eqx.Module):
         """Bounds of f on a box inside X, from slope and offset alone; shape (*out)."""
         if not isinstance(box, Interval):
             raise ValueError(f"AffineForm.over: `box` must be an Interval of shape (n,), got {type(box).__name__}")
-        slope = jnp.moveaxis(jnp.asarray(self.slope), -1, 0)
-        return guard(box_sum(slope_image(slope, box.astype(slope.dtype)), self.offset))
+        return in_numpy(partial(_over, self), box.astype(jnp.result_type(self.slope)), self)
+
+
+def _over(form: AffineForm, box: Interval) -> Interval:
+    return guard(box_sum(slope_image(jnp.moveaxis(jnp.asarray(form.slope), -1, 0), box), form.offset))
 
 
 @named_arguments
@@ -76,10 +82,10 @@ def natural(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("natural", box, args)
         if not is_point(box):
-            return _run(f, Node(box), args, _finish_range)
+            return _run(f, box, Node, args, lambda node, _: _finish_range(node))
         token = POINT_MODE.set(True)
         try:
-            return _run(f, _variable(box), args, _finish_range)
+            return _run(f, box, _variable, args, lambda node, _: _finish_range(node))
         finally:
             POINT_MODE.reset(token)
 
@@ -103,7 +109,7 @@ def affine(f: Callable[..., Any], rounding: Rounding | None = None) -> Callable[
     @rounded_by("inclusion.affine", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("affine", box, args)
-        return _run(f, _variable(box), args, lambda node: _finish_affine(node, box))
+        return _run(f, box, _variable, args, _finish_affine)
 
     return bounds
 
@@ -126,7 +132,7 @@ def jacobian(f: Callable[..., Any], rounding: Rounding | None = None) -> Callabl
     @rounded_by("inclusion.jacobian", rounding)
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("jacobian", box, args)
-        return _run(f, _variable(box, derivative=True), args, lambda node: _finish_jacobian(node, box))
+        return _run(f, box, partial(_variable, derivative=True), args, _finish_jacobian)
 
     return bounds
 
@@ -140,6 +146,7 @@ def mean_value(f: Callable[..., Any], rounding: Rounding | None = None) -> Calla
     at, slope = natural(f), jacobian(f)
 
     @rounded_by("inclusion.mean_value", rounding)
+    @by_numpy
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("mean_value", box, args)
         center = box.center
@@ -182,7 +189,13 @@ def _variable(box: Interval, derivative: bool = False) -> Node:
     return Node(box, Form(eye, Interval.unchecked(zero, zero), InputBox.of(box)), jac)
 
 
-def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable[[Any], Any]) -> Any:
+def _run(
+    f: Callable[..., Any],
+    box: Interval,
+    start: Callable[[Interval], Node],
+    args: tuple[Any, ...],
+    finish: Callable[[Node, Interval], Any],
+) -> Any:
     """Trace f on shapes alone, interpret what comes out, and give the results f's own structure."""
 
     def is_box(value: Any) -> bool:
@@ -190,21 +203,27 @@ def _run(f: Callable[..., Any], x: Node, args: tuple[Any, ...], finish: Callable
 
     def convert(arg: Any) -> Any:
         if is_box(arg):
-            return Node(arg.astype(x.dtype))
-        arg = jnp.asarray(arg)
-        return arg.astype(x.dtype) if jnp.issubdtype(arg.dtype, jnp.floating) else arg
+            return arg.astype(box.lower.dtype)
+        arg = as_array(arg) if isinstance(arg, np.ndarray | np.generic) else jnp.asarray(arg)
+        return arg.astype(box.lower.dtype) if jnp.issubdtype(arg.dtype, jnp.floating) else arg
 
     values = jax.tree.map(convert, args, is_leaf=is_box)
-    shapes = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), values, is_leaf=is_node)
+    shapes = jax.tree.map(lambda v: jax.ShapeDtypeStruct(v.shape, v.dtype), values, is_leaf=is_box)
     if not callable(f):
         raise ValueError(f"inclusion: bounds are of a function of x, got {type(f).__name__}")
-    closed, out = _traced(f, jax.ShapeDtypeStruct(x.shape, x.dtype), *shapes)
-    _check_results(closed, x.shape)
-    inputs = [x, *jax.tree.leaves(values, is_leaf=is_node)]
-    results = evaluate(closed.jaxpr, closed.consts, inputs)
-    nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
-    nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
-    return jax.tree.unflatten(jax.tree.structure(out), [finish(_in_type(node, x.dtype)) for node in nodes])
+    closed, out = _traced(f, jax.ShapeDtypeStruct(box.shape, box.lower.dtype), *shapes)
+    _check_results(closed, box.shape)
+    given = jax.tree.leaves(values, is_leaf=is_box)
+
+    def found(box: Interval) -> list[Any]:
+        x = start(box)
+        inputs = [x, *(Node(value) if is_box(value) else value for value in given)]
+        results = evaluate(closed.jaxpr, closed.consts, inputs)
+        nodes = [v if is_node(v) else as_node(v, jnp.shape(v), x.dtype) for v in results]
+        nodes = [v if jnp.issubdtype(v.dtype, jnp.floating) else _as_numbers(v, x.dtype) for v in nodes]
+        return [finish(_in_type(node, x.dtype), box) for node in nodes]
+
+    return jax.tree.unflatten(jax.tree.structure(out), in_numpy(found, box, (given, closed.consts)))
 
 
 def _traced(f: Callable[..., Any], x: Any, *args: Any) -> tuple[Any, Any]:
@@ -300,14 +319,14 @@ def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("affine", box, args)
 
-        def finish(node: Node) -> tuple[AffineForm, Any]:
+        def finish(node: Node, box: Interval) -> tuple[AffineForm, Any]:
             slope = slope_of(node, InputBox.of(box))
             slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
             good, bounds = jnp.isfinite(add_up(abs(slope))), guard(node.range)
             slope, slack = (jnp.where(good[..., None], v, 0) for v in (slope, slack))
             return AffineForm(slope, choose(good, guard(node.offset), bounds), bounds), slack
 
-        return _run(f, _variable(box), args, finish)
+        return _run(f, box, _variable, args, finish)
 
     return bounds
 

@@ -8,6 +8,7 @@ never enter a product that a gradient flows through, because ``0 * inf`` in a ba
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -18,7 +19,7 @@ from jax.core import Tracer
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.cast import cast_down, cast_towards, cast_up
+from gsisio_jax.interval.cast import cast_down, cast_known, cast_up
 from gsisio_jax.interval.minmax import cut, larger, raised, smaller
 from gsisio_jax.interval.primitives import fusion_barrier
 from gsisio_jax.interval.reading import check_type, read_array
@@ -111,10 +112,9 @@ class Interval(eqx.Module):
     @property
     def center(self) -> Any:
         """Middle of the box; the finite side where one side is infinite, 0 where both are. Never NaN."""
-        xp = _namespace(self.lower, self.upper)
-        low, high = xp.isfinite(self.lower), xp.isfinite(self.upper)
-        a, b = xp.where(low, self.lower, 0.0), xp.where(high, self.upper, 0.0)
-        return xp.where(low & high, 0.5 * a + 0.5 * b, a + b)
+        if _namespace(self.lower, self.upper) is np:
+            return _center(np, self.lower, self.upper)
+        return _compiled_center(self.lower, self.upper)
 
     @property
     def width(self) -> Any:
@@ -222,7 +222,15 @@ def _inside(lower: Any, upper: Any, value: Any, margin: Any) -> Any:
     return (lower + margin <= value) & (value <= upper - margin)
 
 
-_compiled_inside = jax.jit(_inside, inline=True)  # one program instead of one for each operation
+def _center(xp: Any, lower: Any, upper: Any) -> Any:
+    low, high = xp.isfinite(lower), xp.isfinite(upper)
+    a, b = xp.where(low, lower, 0.0), xp.where(high, upper, 0.0)
+    return xp.where(low & high, 0.5 * a + 0.5 * b, a + b)
+
+
+# One program instead of one for each operation.
+_compiled_inside = jax.jit(_inside, inline=True)
+_compiled_center = jax.jit(partial(_center, jnp), inline=True)
 
 
 def _namespace(*values: Any) -> Any:
@@ -234,7 +242,7 @@ def _representable(value: Any, towards: float) -> Any:
     dtype = jax.dtypes.canonicalize_dtype(value.dtype)
     if isinstance(value, jax.Array) or value.dtype == dtype:
         return value
-    return np.asarray(cast_towards(value, dtype, towards))
+    return cast_known(value, dtype, towards)
 
 
 def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
@@ -329,6 +337,11 @@ def _check_pair(call: str, a: Any, b: Any) -> None:
 def hull(a: Interval, b: Interval) -> Interval:
     """The smallest box that contains both boxes, elementwise."""
     _check_pair("hull", a, b)
+    return _hull(a, b)
+
+
+@partial(jax.jit, inline=True)
+def _hull(a: Interval, b: Interval) -> Interval:
     return Interval.unchecked(smaller(a.lower, b.lower), larger(a.upper, b.upper))
 
 
@@ -347,6 +360,11 @@ def intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
         overflowed) is passed over.
     """
     _check_pair("intersect", a, b)
+    return _intersect(a, b)
+
+
+@partial(jax.jit, inline=True)
+def _intersect(a: Interval, b: Interval) -> tuple[Interval, Any]:
     slack = smaller(a.upper - b.lower, b.upper - a.lower)
     lower, upper = raised(a.lower, b.lower), cut(a.upper, b.upper)
     empty = upper < lower

@@ -9,22 +9,24 @@ import jax.numpy as jnp
 import numpy as np
 
 
+def as_array(value: Any, dtype: Any = None) -> Any:
+    """`jnp.asarray`, which compiles a program for every shape of a NumPy array; here numbers that are known are copied
+    to the device, and nothing is compiled."""
+    if isinstance(value, jax.Array):
+        return value if dtype is None else value.astype(dtype)
+    value = np.asarray(value)
+    # A copy: the array on the device may be the very memory that it is given.
+    return jax.device_put(np.array(value, jax.dtypes.canonicalize_dtype(value.dtype if dtype is None else dtype)))
+
+
 def cast_towards(value: Any, dtype: Any, towards: float) -> Any:
     """Cast to `dtype`, towards -inf or inf where the number does not fit."""
     dtype = jax.dtypes.canonicalize_dtype(dtype)
-    if value.dtype == dtype:
-        return jnp.asarray(value)
-    tiny = float(jnp.finfo(dtype).tiny)
     if isinstance(value, np.ndarray | np.generic):
-        # On the host, before JAX sees the number: with 64-bit types off, JAX itself would round to nearest.
-        exact: Any = value
-        with np.errstate(all="ignore"):
-            cast = np.asarray(exact, dtype)
-            wrong = cast > exact if towards < 0 else cast < exact
-            moved = np.nextafter(cast, np.asarray(towards, dtype))
-            # Compiled code takes subnormal numbers for zero: they are no bounds.
-            moved = np.where(np.abs(moved) < tiny, np.copysign(tiny, towards), moved)
-            return jnp.asarray(np.where(wrong, moved, cast), dtype)
+        return as_array(cast_known(value, dtype, towards))
+    if value.dtype == dtype:
+        return value
+    tiny = float(jnp.finfo(dtype).tiny)
     cast = value.astype(dtype)
     if jnp.finfo(dtype).bits >= jnp.finfo(value.dtype).bits:
         return cast
@@ -37,6 +39,21 @@ def cast_towards(value: Any, dtype: Any, towards: float) -> Any:
     moved = jnp.where(jnp.isfinite(fixed), cast + jnp.where(jnp.isfinite(step), step, 0), largest)
     moved = jnp.where(abs(fixed) <= tiny, jnp.copysign(2 * tiny, towards), moved)
     return jnp.where(wrong, moved, cast)
+
+
+def cast_known(value: Any, dtype: Any, towards: float) -> np.ndarray:
+    """`cast_towards` in NumPy, before JAX sees the number: with 64-bit types off, JAX itself would round to nearest."""
+    if value.dtype == dtype:
+        return np.asarray(value)
+    exact: Any = value
+    tiny = float(np.finfo(dtype).tiny)
+    with np.errstate(all="ignore"):
+        cast = np.asarray(exact, dtype)
+        wrong = cast > exact if towards < 0 else cast < exact
+        moved = np.nextafter(cast, np.asarray(towards, dtype))
+        # Compiled code takes subnormal numbers for zero: they are no bounds.
+        moved = np.where(np.abs(moved) < tiny, np.copysign(tiny, towards), moved)
+        return np.asarray(np.where(wrong, moved, cast), dtype)
 
 
 def cast_down(value: Any, dtype: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -42,7 +43,16 @@ def linear_image(matrix: Float[Array, "m n"], x: Interval) -> Interval:
         raise ValueError(
             f"linear_image: a matrix (m, n) and a box (n,) are needed, got {np.shape(matrix)} and {x.shape}"
         )
-    return nan_to_unbounded(image(matrix, x.astype(jnp.result_type(matrix, x.dtype))))
+    x = x.astype(jnp.result_type(matrix, x.dtype))
+    known = all(map(is_concrete, (matrix, x.lower, x.upper)))
+    return _compiled_image(rounding.outward(), matrix, x) if known else nan_to_unbounded(image(matrix, x))
+
+
+@partial(jax.jit, static_argnums=0, inline=True)
+def _compiled_image(outward: bool, matrix: Any, x: Interval) -> Interval:
+    """One program instead of one for each operation."""
+    with rounding.using("outward" if outward else "nearest"):
+        return nan_to_unbounded(image(matrix, x))
 
 
 def image(matrix: Any, x: Interval) -> Interval:

@@ -40,6 +40,7 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from gsisio_jax.interval.primitives import add_up, fusion_barrier
 
@@ -47,6 +48,7 @@ Rounding = Literal["outward", "nearest"]
 _MODE: ContextVar[str] = ContextVar("gsisio_jax_rounding", default="outward")
 _NORMAL: ContextVar[bool] = ContextVar("gsisio_jax_normal", default=False)
 _FLOOR = 4.0  # smallest normal numbers that every widening adds
+_FEW = 10_000  # entries; more stay where they are, on the device
 FLUSHED = 2.0**60
 """Smallest normal numbers that cover whatever is lost where the terms of a sum are flushed to zero; see `generous`."""
 
@@ -252,6 +254,11 @@ def _normal(x: Any, side: float) -> Any:
         tiny = float(np.finfo(x.dtype).tiny)
         outward_side = np.where(x * side > 0, x.dtype.type(side * tiny), x.dtype.type(0))
         return np.where((x != 0) & (np.abs(x) < tiny), outward_side, x)
+    if not isinstance(x, Tracer) and x.size < _FEW:
+        # Looked at in NumPy, as a program would be compiled for every shape; there is hardly ever anything to change.
+        given = np.asarray(x)
+        if not ((given != 0) & (np.abs(given) < np.finfo(given.dtype).tiny)).any():
+            return x
     return _normal_bits(x, side)
 
 

@@ -15,7 +15,7 @@ from gsisio_jax import inclusion
 from gsisio_jax.inclusion.transforms import AffineForm, affine_with_slack
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.cast import cast_down, cast_up
+from gsisio_jax.interval.cast import cast_known
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 
@@ -97,7 +97,7 @@ class Enclosures(NamedTuple):
 def known(box: Interval, dtype: Any) -> Interval:
     """`Interval.astype` in NumPy: JAX would compile each of its operations by itself."""
     lower, upper = (np.asarray(side) for side in (box.lower, box.upper))
-    sides = np.asarray(cast_down(lower, dtype)), np.asarray(cast_up(upper, dtype))
+    sides = cast_known(lower, dtype, -np.inf), cast_known(upper, dtype, np.inf)
     return Interval.unchecked(*rounding.normal(*sides))
 
 

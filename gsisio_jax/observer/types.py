@@ -17,6 +17,7 @@ import numpy as np
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.interval.cast import as_array
 from gsisio_jax.interval.rounding import Rounding, check_rounding
 from gsisio_jax.observer.bank import CancellationResidual, LinearBounds
 from gsisio_jax.observer.certificate import Certificate
@@ -246,7 +247,11 @@ def cast(tree: Any, dtype: Any) -> Any:
     def converted(leaf: Any) -> Any:
         if isinstance(leaf, bounds):
             return leaf.astype(dtype)
-        return jnp.asarray(leaf) if jnp.issubdtype(jnp.result_type(leaf), jnp.bool_) else jnp.asarray(leaf, dtype)
+        kind = None if jnp.issubdtype(jnp.result_type(leaf), jnp.bool_) else dtype
+        if not is_concrete(leaf):
+            return jnp.asarray(leaf, kind)
+        unchanged = isinstance(leaf, jax.Array) and (kind is None or leaf.dtype == kind) and not leaf.weak_type
+        return leaf if unchanged else as_array(np.asarray(leaf), kind)  # JAX would compile a cast for every shape
 
     return jax.tree.map(
         converted,

@@ -98,8 +98,7 @@ def applied(graph: Graph, eqn: Any, args: list[Any], stage: str) -> Sequence[Any
         return [_entries(graph, eqn, args)]
     fixed = [known(arg, atom.aval.dtype) for arg, atom in zip(args, eqn.invars, strict=True)]
     if all(value is not None for value in fixed):
-        with jax.ensure_compile_time_eval():
-            return [constants(np.asarray(value)) for value in bind(eqn, fixed)]
+        return [constants(value) for value in _of_constants(eqn, fixed)]
     return _parts(graph, eqn, args)
 
 
@@ -115,6 +114,13 @@ def bind(eqn: Any, args: Sequence[Any]) -> Sequence[Any]:
     info = called_jaxpr(eqn)[0].debug_info._replace(arg_names=names, result_paths=results)
     alone = jex.Jaxpr((), list(first.values()), eqn.outvars, [eqn], eqn.effects, info)
     return jex.jaxpr_as_fun(jex.ClosedJaxpr(alone, ()))(*(given[key] for key in first))
+
+
+def _of_constants(eqn: Any, args: Sequence[Any]) -> Sequence[Any]:
+    """Results of an equation on constants, in NumPy: JAX would compile each of its operations."""
+    from gsisio_jax.scalar.numpy_program import numpy_function  # which needs this module
+
+    return numpy_function(lambda *given: bind(eqn, given), *args)(*args)
 
 
 def called_jaxpr(eqn: Any) -> tuple[Any, Sequence[Any]]:
@@ -184,8 +190,7 @@ def _entries(graph: Graph, eqn: Any, args: list[Any]) -> np.ndarray:
             continue
         value = graph.apply(name, *operands, dtype=dtype, equation=eqn, key=key)
         if isinstance(value, Number) and value.name == name and all(map(is_constant, value.operands)):
-            with jax.ensure_compile_time_eval():  # a library function of constants
-                value = np.asarray(bind(eqn, [np.asarray(v) for v in operands])[0])[()]
+            value = _of_constants(eqn, [np.asarray(v) for v in operands])[0][()]  # a library function
         found.append(value)
     return collected(found, shape)
 

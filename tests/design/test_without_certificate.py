@@ -2,6 +2,7 @@
 
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -45,6 +46,15 @@ def test_the_operation_and_the_line_are_named(function, operation, fault):
     (found,) = culprits(function, SQUARE)
     assert (found.operation, found.fault) == (operation, fault)
     assert found.place.endswith(f"{__file__.rsplit('/', 1)[-1]}:{function.__code__.co_firstlineno}")
+
+
+def test_a_long_loop_is_judged_as_a_whole():
+    def function(x):
+        turned, _ = jax.lax.scan(lambda carry, _: (0.9 * carry + jnp.sqrt(jnp.abs(carry)), None), x, None, length=40)
+        return turned
+
+    (found,) = culprits(function, SQUARE)
+    assert (found.operation, found.fault) == ("scan", "has an unbounded derivative")
 
 
 def test_what_is_bounded_has_no_culprit():

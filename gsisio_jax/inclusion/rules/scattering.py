@@ -18,6 +18,7 @@ from gsisio_jax.inclusion.form_arithmetic import known_if_concrete
 from gsisio_jax.inclusion.node import Node, is_node, normalised
 from gsisio_jax.inclusion.rules.linear import move, negative, structural
 from gsisio_jax.interval.box import is_concrete
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 _MOST = 1 << 20
 _UNKNOWN = "with indices that are not known while tracing"
@@ -30,10 +31,13 @@ def meets(eqn: Any, indices: Any) -> np.ndarray | None:
     if is_node(indices) or not is_concrete(indices) or count * math.prod(operand.shape) > _MOST or not count:
         return None
     params = {key: eqn.params[key] for key in ("dimension_numbers", "indices_are_sorted", "mode")}
-    with jax.ensure_compile_time_eval():
-        units = jnp.eye(count).reshape(count, *updates.shape)
-        zeros, at = jnp.zeros(operand.shape, units.dtype), jnp.asarray(indices)
-        found = jax.vmap(lambda unit: jax.lax.scatter_add(zeros, at, unit, **params))(units)
+    units = np.eye(count, dtype=np.float32).reshape(count, *updates.shape)
+    zeros = np.zeros(operand.shape, np.float32)
+
+    def landed(at: Any) -> Any:
+        return jax.vmap(lambda unit: jax.lax.scatter_add(jnp.asarray(zeros), at, unit, **params))(units)
+
+    found = numpy_function(landed, np.asarray(indices))(np.asarray(indices))
     return np.rint(np.asarray(found)).astype(int).reshape(count, -1).T
 
 

@@ -225,7 +225,6 @@ def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLi
         np.asarray(part, to.dtype) for part, to in zip((knots, values), eqn.params["jaxpr"].in_avals[1:3], strict=True)
     ]
 
-    @jax.jit
     @jax.vmap
     def at(t: Any) -> Any:
         return body(jnp.full(aval.shape, t, aval.dtype), *table, *others)[0].ravel()[0]
@@ -234,8 +233,7 @@ def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLi
     steps = np.array([2.0, 1.0, 1e-3]) * span
     middles = 0.5 * knots[1:] + 0.5 * knots[:-1]
     points = np.concatenate([knots, middles, knots[0] - steps, knots[-1] + steps]).astype(aval.dtype)
-    with jax.ensure_compile_time_eval():
-        theirs = np.asarray(at(jnp.asarray(points)))
+    theirs = np.asarray(numpy_function(at, points)(points))
     left, right = theirs[-6:-3], theirs[-3:]
     flat = [bool((side == side[0]).all()) for side in (left, right)]
     if all(flat):
