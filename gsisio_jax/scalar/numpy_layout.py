@@ -48,15 +48,8 @@ def layout_source(name: str, params: Any, given: Sequence[Any], out: Any) -> str
         return f"spread({{0}}.reshape({_plain(wide)}), {shape})" if math.prod(shape) < _LARGE else None
     if name == "slice":
         strides = params["strides"] or (1,) * len(x.shape)
-        ends = zip(params["start_indices"], params["limit_indices"], strides, x.shape, strict=True)
-        return _index(
-            ":"
-            if (start, stop, stride) == (0, size, 1)
-            else f"{start}:{stop}:{stride}"
-            if stride != 1
-            else f"{start}:{stop}"
-            for start, stop, stride, size in ends
-        )
+        ends = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
+        return _index(f"{start}:{stop}:{stride}" if stride != 1 else f"{start}:{stop}" for start, stop, stride in ends)
     if name == "rev":
         return _index("::-1" if i in params["dimensions"] else ":" for i in range(len(x.shape)))
     if name == "transpose":

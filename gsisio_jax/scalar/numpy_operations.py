@@ -18,12 +18,16 @@ from gsisio_jax.scalar.numpy_source import FLOATING_ONLY
 
 def numpy_operation(eqn: Any) -> Callable[..., Sequence[Any]]:
     """The operation of an equation: values of its arguments to those of its results."""
-    return operation_of(eqn.primitive, eqn.params, [v.aval for v in eqn.invars])
+    found = operation_of(eqn.primitive.name, eqn.primitive, eqn.params, [v.aval for v in eqn.invars])
+    assert found is not None
+    return found
 
 
-def operation_of(primitive: Any, params: dict[str, Any], given: Sequence[Any]) -> Callable[..., Sequence[Any]]:
-    """The same from the primitive, its parameters, and shapes and types of its arguments."""
-    name = primitive.name
+def operation_of(
+    name: str, primitive: Any, params: dict[str, Any], given: Sequence[Any]
+) -> Callable[..., Sequence[Any]] | None:
+    """The same from the primitive (None where it is not known: then of NumPy's operations alone), its parameters, and
+    shapes and types of its arguments."""
     if all(isinstance(kind.dtype, np.dtype) for kind in given):  # random keys are JAX's
         if (function := elementwise(name, given)) is not None:
             return lambda *args: (function(*args),)
@@ -37,7 +41,7 @@ def operation_of(primitive: Any, params: dict[str, Any], given: Sequence[Any]) -
             return lambda x: (np.rint(x),)
         if name == "sort" and (params["num_keys"] == 1 or len(given) == 1):
             return lambda *args: _sort(params["dimension"], *args)
-    return _given_to_jax(primitive, params)
+    return None if primitive is None else _given_to_jax(primitive, params)
 
 
 def elementwise(name: str, given: Sequence[Any]) -> Callable[..., Any] | None:
@@ -193,7 +197,8 @@ def _junction(of_bits: np.ufunc, of_truth: np.ufunc) -> Callable[..., Any]:
 
 # Exact, or correctly rounded.
 _ELEMENTWISE: dict[str, Callable[..., Any]] = {
-    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "abs": np.abs,
+    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
+    "abs": np.abs,
     "max": np.maximum, "min": np.minimum, "larger": np.maximum, "smaller": np.minimum, "sign": np.sign,
     "raised": lambda a, b: np.where(b > a, b, a), "cut": lambda a, b: np.where(b < a, b, a), "floor": np.floor,
     "ceil": np.ceil, "sqrt": np.sqrt, "square": np.square, "is_finite": np.isfinite, "scale": _scale, "times": _times,

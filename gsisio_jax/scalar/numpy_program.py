@@ -13,9 +13,10 @@ import jax.extend.core as jex
 import numpy as np
 
 from gsisio_jax._collector import rare_collection
+from gsisio_jax.scalar.numpy_numbers import SAME, add_numbers, has_numbers_of_numpy
 from gsisio_jax.scalar.numpy_operations import numpy_operation, plain
 from gsisio_jax.scalar.numpy_source import Operation, as_code, source
-from gsisio_jax.scalar.primitive import written
+from gsisio_jax.scalar.primitive import numbers_of, written
 from gsisio_jax.scalar.unroll import called_jaxpr
 
 _CALLS = {
@@ -26,8 +27,6 @@ _MOST_TURNS = 1000  # of a loop: a longer one is worth compiling
 _FEW_RUNS = 6  # a program that runs oftener becomes Python's code, which takes about as long as these
 
 
-# What leaves its first argument as it is.
-_SAME = {"stop_gradient", "fusion_barrier", "copy", "wave", "falling_wave"}
 _MAYBE_SAME = {"reshape", "squeeze", "expand_dims", "broadcast_in_dim", "convert_element_type"}
 
 
@@ -97,17 +96,24 @@ class _Program:
 
         for eqn in jaxpr.eqns:
             operands = [of(atom) for atom in eqn.invars]
-            if (function := written(eqn)) is not None:
-                body = jax.make_jaxpr(function)(*(atom.aval for atom in eqn.invars))
-                found = self.add(body.jaxpr, body.consts, operands)
-            elif eqn.primitive.name in _CALLS:
-                found = self.add(*called_jaxpr(eqn), operands)
-            elif _is_same(eqn):
-                found = operands[:1]
-            else:
-                found = self._append(eqn, operands)
-            places.update(zip(eqn.outvars, found, strict=True))
+            places.update(zip(eqn.outvars, self.equation(eqn, operands), strict=True))
         return [of(atom) for atom in jaxpr.outvars]
+
+    def equation(self, eqn: Any, operands: list[int]) -> list[int]:
+        """Append one equation of any kind; places of its results."""
+        if (program := numbers_of(eqn)) is not None and has_numbers_of_numpy(program):
+            return add_numbers(self, program, operands)
+        if (function := written(eqn)) is not None:
+            body = jax.make_jaxpr(function)(*(atom.aval for atom in eqn.invars))
+            return self.add(body.jaxpr, body.consts, operands)
+        if eqn.primitive.name in _CALLS:
+            return self.add(*called_jaxpr(eqn), operands)
+        if _is_same(eqn):
+            return operands[:1]
+        given, found = ([v.aval for v in group] for group in (eqn.invars, eqn.outvars))
+        return self.append(
+            _operation(eqn), operands, given, found, source(eqn.primitive.name, eqn.params, given, found)
+        )
 
     def drop_unused(self) -> None:
         """Leave operations out whose results nothing needs."""
@@ -129,15 +135,18 @@ class _Program:
                 values[place] = value
         return [values[i] for i in self.outputs]
 
-    def _append(self, eqn: Any, operands: list[int]) -> list[int]:
-        known, function = [self.values[i] for i in operands], _operation(eqn)
+    def append(
+        self, function: Callable[..., Sequence[Any]], operands: list[int], given: Sequence[Any], found: Sequence[Any],
+        text: str | None = None,
+    ) -> list[int]:  # fmt: skip
+        """An operation on values of kinds `given`, with results of kinds `found`; at once where its operands are
+        known."""
+        known = [self.values[i] for i in operands]
         if all(value is not None for value in known):
             return [self.place(value) for value in function(*known)]
-        found = [self.place() for _ in eqn.outvars]
-        given, results = ([v.aval for v in group] for group in (eqn.invars, eqn.outvars))
-        text = source(eqn.primitive.name, eqn.params, given, results)
-        self.operations.append(Operation(function, operands, found, given, results, text))
-        return found
+        results = [self.place() for _ in found]
+        self.operations.append(Operation(function, operands, results, given, found, text))
+        return results
 
 
 def _is_same(eqn: Any) -> bool:
@@ -145,7 +154,7 @@ def _is_same(eqn: Any) -> bool:
     if name in _MAYBE_SAME:
         before, after = eqn.invars[0].aval, eqn.outvars[0].aval
         return len(eqn.invars) == 1 and before.shape == after.shape and before.dtype == after.dtype
-    return name in _SAME or (name == "optimization_barrier" and len(eqn.invars) == 1)
+    return name in SAME or (name == "optimization_barrier" and len(eqn.invars) == 1)
 
 
 def _operation(eqn: Any) -> Callable[..., Sequence[Any]]:

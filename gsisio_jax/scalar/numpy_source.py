@@ -66,9 +66,9 @@ def source(name: str, params: Any, given: Sequence[Any], found: Sequence[Any]) -
     if len(found) != 1 or not given or not all(isinstance(kind.dtype, np.dtype) for kind in (*given, *found)):
         return None
     first, (out,) = given[0].dtype, found
-    if (name in FLOATING_ONLY and first.kind != "f") or (name in _WHOLE and first == bool):
+    if (name in FLOATING_ONLY and first.kind != "f") or (name in _WHOLE and first.kind == "b"):
         return None
-    if name == "select_n" and first == bool and len(given) == 3:
+    if name == "select_n" and first.kind == "b" and len(given) == 3:
         return "{2} if {0} else {1}" if given[0].shape == () else "where({0}, {2}, {1})"
     if name == "integer_pow" and first.kind == "f" and params["y"] in (2, 3):
         return "{0} * {0}" if params["y"] == 2 else "{0} * ({0} * {0})"
@@ -80,7 +80,7 @@ def source(name: str, params: Any, given: Sequence[Any], found: Sequence[Any]) -
     if name == "convert_element_type":
         return _converted(first, out.dtype)
     if name == "not":
-        return "not {0}" if first == bool else "~{0}"
+        return "not {0}" if first.kind == "b" else "~{0}"
     if name == "times" and first == np.float32:
         return "p if (p := {0} * {1}) == p else zero_float32"
     return (_DOUBLES.get(name) if first == np.float64 else None) or _NUMBERS.get(name)
@@ -96,11 +96,11 @@ _PYTHON = {"float64": "float", "bool": "bool"}
 
 def _converted(before: np.dtype, after: np.dtype) -> str | None:
     """None where NumPy would complain of what does not fit."""
-    if after == bool:
+    if after.kind == "b":
         return "{0} != 0"
     if after.kind == "f" and after.name in ("float32", "float64") and before.kind in "fiub":
         return "float({0})" if after == np.float64 else "float32({0})"
-    return f"{after.name}({{0}})" if before == bool and after.name in ("int32", "int64") else None
+    return f"{after.name}({{0}})" if before.kind == "b" and after.name in ("int32", "int64") else None
 
 
 def as_code(

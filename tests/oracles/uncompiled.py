@@ -22,7 +22,7 @@ from oracles.uncompiled_calls import FEW, MOST
 from oracles.uncompiled_calls import in_numpy as in_numpy
 
 from gsisio_jax.observer import estimation
-from gsisio_jax.scalar.numpy_program import numpy_function
+from gsisio_jax.scalar.numpy_program import numpy_function, numpy_program
 
 NAMES = ("_estimate", "_start", "_step", "_resume")
 _programs: dict[Any, Callable[..., Any]] = {}
@@ -68,8 +68,9 @@ class _Traced:
         shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
         self.closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
         self.structure = jax.tree.structure(shape)
-        kinds = [v.aval.shape == () for eqn in _equations(self.closed.jaxpr) for v in eqn.outvars]
-        self.of_numbers = np.mean(kinds) > 0.8
+        equations = list(_equations(self.closed.jaxpr))
+        kinds = [v.aval.shape == () for eqn in equations for v in eqn.outvars]
+        self.of_numbers = np.mean(kinds) > 0.8 or any(eqn.primitive.name == "scalar_program" for eqn in equations)
 
     def mapped(self, axes: Sequence[Sequence[int | None]]) -> Callable[..., Sequence[Any]]:
         """As a function of JAX, under as many `jax.vmap` as there are axes."""
@@ -98,7 +99,7 @@ def _values(args: Sequence[Any], program: _Traced, axes: Any) -> Sequence[Any]:
         return [np.stack(column) for column in zip(*(_values(row, program, axes[:-1]) for row in rows), strict=True)]
     key = program, axes, tuple(arg.shape for arg in args)
     if key not in _programs:
-        _programs[key] = numpy_function(program.mapped(axes), *args)
+        _programs[key] = numpy_function(program.mapped(axes), *args) if axes else numpy_program(program.closed)
     return _programs[key](*args)
 
 
