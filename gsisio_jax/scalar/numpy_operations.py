@@ -79,6 +79,11 @@ def _jitted(primitive: Any, params: tuple[tuple[str, Any], ...]) -> Callable[...
     return jax.jit(lambda *args: primitive.bind(*args, **dict(params)))
 
 
+def _sign(x: Any) -> Any:
+    """Of a zero, the zero itself."""
+    return np.where(x == 0, x, np.sign(x))
+
+
 def _scale(factor: Any, value: Any) -> Any:
     return np.where(factor == 0, factor.dtype.type(0), factor * value)
 
@@ -199,7 +204,7 @@ def _junction(of_bits: np.ufunc, of_truth: np.ufunc) -> Callable[..., Any]:
 _ELEMENTWISE: dict[str, Callable[..., Any]] = {
     "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
     "abs": np.abs,
-    "max": np.maximum, "min": np.minimum, "larger": np.maximum, "smaller": np.minimum, "sign": np.sign,
+    "max": np.maximum, "min": np.minimum, "larger": np.maximum, "smaller": np.minimum, "sign": _sign,
     "raised": lambda a, b: np.where(b > a, b, a), "cut": lambda a, b: np.where(b < a, b, a), "floor": np.floor,
     "ceil": np.ceil, "sqrt": np.sqrt, "square": np.square, "is_finite": np.isfinite, "scale": _scale, "times": _times,
     "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal,

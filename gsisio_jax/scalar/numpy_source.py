@@ -48,14 +48,14 @@ _ARRAYS = {name: _NUMBERS[name] for name in (
 )} | {
     "square": "square({0})", "max": "maximum({0}, {1})", "min": "minimum({0}, {1})", "larger": "maximum({0}, {1})",
     "smaller": "minimum({0}, {1})", "raised": "where({1} > {0}, {1}, {0})", "cut": "where({1} < {0}, {1}, {0})",
-    "is_finite": "isfinite({0})", "not": "~{0}", "floor": "floor({0})", "ceil": "ceil({0})", "sign": "sign({0})",
+    "is_finite": "isfinite({0})", "not": "~{0}", "floor": "floor({0})", "ceil": "ceil({0})",
     "scale": "where({0} == 0, {0}.dtype.type(0), {0} * {1})", "nextafter": "nextafter({0}, {1})",
 }  # fmt: skip
 FLOATING_ONLY = {"div", "sign", "abs", "neg", "sqrt", "square", "floor", "ceil", "is_finite", "scale", "times"}
 _WHOLE = {"add", "add_any", "sub", "mul"}  # of truth values Python's are counts
 _NAMES: dict[str, Any] = {name: getattr(np, name) for name in (
     "add", "bool_", "concatenate", "array", "ceil", "divide", "floor", "float32", "float64", "int32", "int64",
-    "isfinite", "maximum", "minimum", "nextafter", "sign", "sqrt", "square", "where",
+    "isfinite", "maximum", "minimum", "nextafter", "sqrt", "square", "where",
 )}  # fmt: skip
 _NAMES |= {"root": math.sqrt, "nan": math.nan, "filled": filled, "spread": spread, "zero_float32": np.float32(0)}
 
