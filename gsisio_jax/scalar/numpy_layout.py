@@ -64,7 +64,7 @@ def layout_source(name: str, params: Any, given: Sequence[Any], out: Any) -> str
         return f"{{0}}.astype({_TYPES[params['new_dtype'].name]})"
     if name == "reduce_sum" and x.dtype.kind == "f":
         return f"add.reduce({{0}}, {_plain(params['axes'])})"
-    return _product(params, *given) if name == "dot_general" else None
+    return _product(params, x, given[1], out) if name == "dot_general" else None
 
 
 _TYPES = {"float64": "float64", "float32": "float32", "int32": "int32", "int64": "int64", "bool": "bool_"}
@@ -83,10 +83,16 @@ def _all(given: Sequence[Any]) -> str:
     return "".join(f"{{{i}}}, " for i in range(len(given)))
 
 
-def _product(params: Any, a: Any, b: Any) -> str | None:
+def _product(params: Any, a: Any, b: Any, out: Any) -> str | None:
     """The last axis of a with one of b."""
     (over_a, over_b), (batch, _) = params["dimension_numbers"]
     ranks = len(a.shape), len(b.shape)
-    if batch or a.dtype != b.dtype or tuple(over_a) != (ranks[0] - 1,) or len(over_b) != 1 or max(ranks) > 2:
+    if (
+        batch
+        or not a.dtype == b.dtype == out.dtype
+        or tuple(over_a) != (ranks[0] - 1,)
+        or len(over_b) != 1
+        or max(ranks) > 2
+    ):
         return None
     return "{0} @ {1}" if tuple(over_b) == (0,) else "{0} @ {1}.T"

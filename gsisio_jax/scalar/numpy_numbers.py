@@ -81,6 +81,8 @@ def _array(into: Operations, operation: Any, flat: Sequence[Any], of: Callable[[
         start += len(values)
         if all(map(is_constant, values)):
             args.append(into.place(np.array(list(values), dtype).reshape(shape)))
+        elif not shape and values[0].dtype == dtype:
+            args.append(of(values[0]))
         else:
             args.append(_stacked(into, [*map(of, values)], [Kind((), value.dtype) for value in values], shape, dtype))
     found = []

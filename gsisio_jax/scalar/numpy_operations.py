@@ -39,7 +39,7 @@ def operation_of(
             return lambda *args: several(params, *args)
         if name == "round" and int(params["rounding_method"]) == 1:  # to nearest, ties to even
             return lambda x: (np.rint(x),)
-        if name == "sort" and (params["num_keys"] == 1 or len(given) == 1):
+        if name == "sort" and params["num_keys"] == 1 and given[0].dtype.kind in "fiub":
             return lambda *args: _sort(params["dimension"], *args)
     return None if primitive is None else _given_to_jax(primitive, params)
 
@@ -152,7 +152,7 @@ def _dot(params: Any, a: Any, b: Any) -> Any:
 
 def _extreme(function: np.ufunc, initial: float) -> Callable[..., Any]:
     def extreme(params: Any, x: Any) -> Any:
-        first = {"initial": initial} if x.dtype.kind == "f" else {}
+        first: dict[str, Any] = {"initial": initial} if x.dtype.kind == "f" else {}
         return function.reduce(x, tuple(params["axes"]), **first)
 
     return extreme

@@ -23,8 +23,8 @@ class Operation(NamedTuple):
     function: Callable[..., Sequence[Any]]
     operands: list[int]
     results: list[int]
-    given: list[Any]
-    found: list[Any]
+    given: Sequence[Any]
+    found: Sequence[Any]
     source: str | None = None
 
 
@@ -74,9 +74,8 @@ def source(name: str, params: Any, given: Sequence[Any], found: Sequence[Any]) -
         return "{0} * {0}" if params["y"] == 2 else "{0} * ({0} * {0})"
     if out.shape or any(kind.shape for kind in given):
         alike = all(kind.shape == out.shape for kind in given)
-        return (
-            _ARRAYS.get(name) if name in _ARRAYS and alike else _as_number(layout_source(name, params, given, out), out)
-        )
+        text = _ARRAYS.get(name) if alike else None
+        return text or _as_number(layout_source(name, params, given, out), out)
     if name == "convert_element_type":
         return _converted(first, out.dtype)
     if name == "not":
@@ -109,7 +108,7 @@ def as_code(
 ) -> Callable[..., Sequence[Any]]:  # fmt: skip
     """The function of the values at `inputs`, of these kinds, to those at `outputs`; `values` are the constants, None
     elsewhere."""
-    known = dict(_NAMES)
+    known: dict[str, Any] = dict(_NAMES)
     for place, value in enumerate(values):
         if isinstance(value, np.ndarray | np.generic):
             known[f"v{place}"] = value if value.shape else _PLAIN.get(value.dtype.name, lambda x: x[()])(value)

@@ -23,6 +23,7 @@ from oracles.uncompiled_calls import in_numpy as in_numpy
 
 from gsisio_jax.observer import estimation
 from gsisio_jax.scalar.numpy_program import numpy_function, numpy_program
+from gsisio_jax.scalar.program import ScalarProgram
 
 MOST_SECONDS = 0.5
 """Records of a batch that take so long at most are run one by one: to trace a step for many takes longer."""
@@ -90,8 +91,8 @@ def _seconds(jaxpr: Any) -> float:
     total = 0.0
     for eqn in jaxpr.eqns:
         inner = [param.jaxpr for param in eqn.params.values() if hasattr(param, "jaxpr")]
-        if "program" in eqn.params:
-            total += 3e-8 * len(eqn.params["program"].operations)
+        if isinstance(program := eqn.params.get("program"), ScalarProgram):
+            total += 3e-8 * len(program.operations)
         elif inner:
             total += eqn.params.get("length", 1) * sum(map(_seconds, inner))
         else:
@@ -100,7 +101,8 @@ def _seconds(jaxpr: Any) -> float:
 
 
 def _values(args: Sequence[Any], program: _Traced, axes: Any) -> Sequence[Any]:
-    if axes and (count := _size(axes[-1], [arg.shape for arg in args])) * program.seconds <= MOST_SECONDS:
+    count = _size(axes[-1], [arg.shape for arg in args]) if axes else 0
+    if count and count * program.seconds <= MOST_SECONDS:
         rows = (
             [arg if axis is None else arg[i] for arg, axis in zip(args, axes[-1], strict=True)] for i in range(count)
         )
