@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from gsisio_jax.interval.minmax import cut, raised, smaller
 from gsisio_jax.interval.primitives import scale, times
-from gsisio_jax.scalar import numpy_program
+from gsisio_jax.scalar import call, numpy_program, scan
 from gsisio_jax.scalar.numpy_program import numpy_function
+from gsisio_jax.scalar.program import ScalarProgram
 
 
 def test_a_numpy_program_gives_what_jax_gives():
@@ -54,6 +56,9 @@ OPERATIONS = {
     "choice": lambda a, b: (jnp.where(a < b, a, b), jnp.where((a < b) & ~(b == 0) | (a > 1) ^ (b > 1), b, 2.0)),
     "products": lambda a, b: (times(a, b), scale(jnp.where(jnp.isfinite(a), a, 3), b)),
     "loop": lambda a, b: jax.lax.fori_loop(0, 20, lambda i, x: jnp.where(x < i, x + a, x * b), a),
+    "truth": lambda a, b: (~(a < b), ~jnp.isfinite(a), (a > b).astype(a.dtype) - b, a.astype(bool), (a < b) == (b < 1)),
+    "roots": lambda a, b: (jnp.sqrt(a), jnp.sqrt(a) / b, jnp.float32(a) * 2, jnp.float64(a) + 1, jnp.sign(a), a % b),
+    "slopes": lambda a, b: jax.vjp(lambda x: (x * b, x - b), a)[1]((b, a)),
     "whole": lambda a, b: (a.astype(jnp.int32) * 3 - 1, (b > a).astype(int) // 2, a > b),
 }  # fmt: skip
 POINTS = (0.0, -0.0, 1.5, -2.0, 1e25, -1e-25, np.inf, -np.inf, np.nan)
@@ -72,9 +77,89 @@ def test_single_numbers_are_those_of_jax(name, dtype, monkeypatch):
         monkeypatch.setattr(numpy_program, "_FEW_RUNS", few)
         program = numpy_function(function, a[0], b[0])
         found = jax.tree.map(lambda *x: np.array(x), *(program(*pair) for pair in zip(a, b, strict=True)))
-        for own, other in zip(jax.tree.leaves(found), map(np.asarray, jax.tree.leaves(wanted)), strict=True):
-            assert own.dtype == other.dtype
-            np.testing.assert_array_equal(own, other)
-            if own.dtype.kind == "f" and name != "extremes":  # the sign of max(0, -0) is anyone's
-                zero = own == 0
-                np.testing.assert_array_equal(np.signbit(own[zero]), np.signbit(other[zero]))
+        _same(found, wanted, signs=name != "extremes")
+
+
+ARRAYS = {
+    "elements": lambda a: (a + a[::-1], jnp.maximum(a, a.T), jnp.minimum(a, 1), ~(a < 1), jnp.isfinite(a), jnp.sqrt(a)),
+    "choice": lambda a: (jnp.where(a[0, 0] < 1, a, -a), jnp.where(a < a.T, a, a.T), jnp.square(a), a**2, a**3, a**-3),
+    "products": lambda a: (times(a, a.T), scale(jnp.where(jnp.isfinite(a), a, 3), a.T), raised(a, a.T), cut(a, a.T)),
+    "order": lambda a: (jnp.sort(a, 0), jnp.sort(a, 1)),
+    "largest": lambda a: jnp.argmax(a, 0),
+    "least": lambda a: jnp.argmin(a, 1),
+    "keys": lambda a: jax.lax.sort((a, a.T, a > 0), dimension=1, num_keys=1),
+    "reduced": lambda a: (a.max(0), a.min(), (a > 0).all(1), (a > 0).any(), jnp.prod(a > 0, 0), (a > 0).sum(dtype=int)),
+    "moved": lambda a: (a[1], a[:, ::2], a[0, 1], a[::-1, 1:], a.T, a.reshape(-1), a[None], jnp.split(a, 3, 1), [*a.T]),
+    "joined": lambda a: (
+        jnp.stack([a, a.T]), jnp.stack([a, a.T], 2), jnp.stack([a[0, 0], a[1, 2]]), jnp.concatenate([a, a], 1),
+    ),
+    "spread": lambda a: (jnp.broadcast_to(a[0], (2, 3)), jnp.full((2, 2), a[1, 1]), a[:, None] - a),
+    "padded": lambda a: (
+        jax.lax.pad(a, a[0, 0], [(1, 2, 0), (0, 1, 2)]), jax.lax.pad(a, a[1, 1], [(-1, 2, 1), (1, -2, 0)]),
+    ),
+    "updated": lambda a: [
+        f(a, i) for i in (-7, -1, 0, 1, 9) for f in (
+            lambda a, i: jax.lax.dynamic_update_slice(a, a[:2, :1], (i, 1 - i)),
+            lambda a, i: jax.lax.dynamic_slice(a, (i, i), (2, 1)),
+        )
+    ],
+    "types": lambda a: (a.astype(np.float32), a.astype(np.float64), a.astype(bool), (a > 0).astype(np.int32), a > a.T),
+    "empty": lambda a: (a[:0] + 1, a[:, :0].max(0), jnp.sort(a[:0], 0), jnp.stack([a[:0], a[:0]]), a[:0].T),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("name", ARRAYS)
+def test_arrays_are_those_of_jax(name, dtype, monkeypatch):
+    """As code from the first run on, and never: bit by bit, with NaN, infinities and signed zeros."""
+    function, points = ARRAYS[name], np.random.default_rng(0).choice(POINTS, (20, 3, 3)).astype(dtype)
+    compiled = jax.jit(function)
+    for few in (1, 10**9):
+        monkeypatch.setattr(numpy_program, "_FEW_RUNS", few)
+        program = numpy_function(function, points[0])
+        for a in points:
+            _same(program(a), compiled(a), signs=name not in ("elements", "reduced", "order", "keys"))
+
+
+def _same(found, wanted, signs=True):
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    for own, other in zip(jax.tree.leaves(found), map(np.asarray, jax.tree.leaves(wanted)), strict=True):
+        assert own.dtype == other.dtype
+        assert own.shape == other.shape
+        np.testing.assert_array_equal(own, other)
+        if own.dtype.kind == "f" and signs:  # the sign of max(0, -0) is anyone's, and which of these comes first
+            zero = own == 0
+            np.testing.assert_array_equal(np.signbit(own[zero]), np.signbit(other[zero]))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_programs_of_numbers_are_not_traced_again(dtype, monkeypatch):
+    """Values, derivatives and operations on arrays within, with what they close over."""
+
+    def function(a, b):
+        def body(x):
+            low = jnp.sort(x)[::-1] + b
+            turned = jax.lax.fori_loop(0, jnp.where(x[0] > 1, 2, 3), lambda i, y: y * x[i] - low, x)
+            return {
+                "a": times(low, x),
+                "b": (turned > x[0], jnp.where(x < 1, x, low)),
+                "c": jnp.float32(low[0]),
+                "d": 2.0,
+            }
+
+        found, slopes = call(body, a), jax.jvp(lambda x: call(lambda x: smaller(x * b, x[::-1]), x), (a,), (b,))
+        return found, slopes, scan(lambda c, x: (c * x + b, c[0] > x), a, jnp.arange(8, dtype=dtype))
+
+    points = np.random.default_rng(1).choice([0.5, -1.5, 2.0, np.inf, np.nan, 0.0], (12, 2, 3)).astype(dtype)
+    compiled = jax.jit(function)
+    for few in (1, 10**9):
+        monkeypatch.setattr(numpy_program, "_FEW_RUNS", few)
+        with monkeypatch.context() as patch:
+            program_call = lambda *_: pytest.fail("traced again")  # noqa: E731
+            closed = jax.make_jaxpr(function)(*points[0])
+            patch.setattr(ScalarProgram, "__call__", program_call)
+            program = numpy_program.numpy_program(closed)
+        for a, b in points:
+            for own, other in zip(program(a, b), jax.tree.leaves(compiled(a, b)), strict=True):
+                assert own.dtype == other.dtype
+                np.testing.assert_allclose(own, other, rtol=4 * np.finfo(own.dtype).eps if own.dtype.kind == "f" else 0)

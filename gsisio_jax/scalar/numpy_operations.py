@@ -11,49 +11,59 @@ from functools import lru_cache
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.scalar.numpy_source import single_numbers
+from gsisio_jax.scalar.numpy_source import FLOATING_ONLY
 
 
 def numpy_operation(eqn: Any) -> Callable[..., Sequence[Any]]:
     """The operation of an equation: values of its arguments to those of its results."""
-    name, params = eqn.primitive.name, eqn.params
-    if any(_is_key(v.aval) for v in eqn.invars):
-        return _given_to_jax(eqn)
-    floating = np.issubdtype(eqn.invars[0].aval.dtype, np.floating) if eqn.invars else False
-    if name in _ELEMENTWISE and (floating or name not in _FLOATING_ONLY):
-        elementwise = _ELEMENTWISE[name]
-        return lambda *args: (elementwise(*args),)
-    if name in _ARRAYS:
-        rule = _ARRAYS[name]
-        return lambda *args: (rule(params, *args),)
-    if name == "round" and int(params["rounding_method"]) == 1:  # to nearest, ties to even
-        return lambda x: (np.rint(x),)
-    if name == "split":
-        ends = np.cumsum(params["sizes"])[:-1]
-        return lambda x: np.split(x, ends, axis=params["axis"])
-    return _given_to_jax(eqn)
+    found = operation_of(eqn.primitive.name, eqn.primitive, eqn.params, [v.aval for v in eqn.invars])
+    assert found is not None
+    return found
 
 
-def _given_to_jax(eqn: Any) -> Callable[..., Sequence[Any]]:
-    by_jax = _by_jax(eqn.primitive, tuple(eqn.params.items()))
+def operation_of(
+    name: str, primitive: Any, params: dict[str, Any], given: Sequence[Any]
+) -> Callable[..., Sequence[Any]] | None:
+    """The same from the primitive (None where it is not known: then of NumPy's operations alone), its parameters, and
+    shapes and types of its arguments."""
+    if all(isinstance(kind.dtype, np.dtype) for kind in given):  # random keys are JAX's
+        if (function := elementwise(name, given)) is not None:
+            return lambda *args: (function(*args),)
+        if name in _ARRAYS:
+            rule = _ARRAYS[name]
+            return lambda *args: (rule(params, *args),)
+        if name in _SEVERAL:
+            several = _SEVERAL[name]
+            return lambda *args: several(params, *args)
+        if name == "round" and int(params["rounding_method"]) == 1:  # to nearest, ties to even
+            return lambda x: (np.rint(x),)
+        if name == "sort" and params["num_keys"] == 1 and given[0].dtype.kind in "fiub":
+            return lambda *args: _sort(params["dimension"], *args)
+    return None if primitive is None else _given_to_jax(primitive, params)
+
+
+def elementwise(name: str, given: Sequence[Any]) -> Callable[..., Any] | None:
+    """The operation without parameters, on arrays of one shape; None if it is not NumPy's."""
+    floating = given and given[0].dtype.kind == "f"
+    return _ELEMENTWISE.get(name) if floating or name not in FLOATING_ONLY else None
+
+
+def _given_to_jax(primitive: Any, params: dict[str, Any]) -> Callable[..., Sequence[Any]]:
+    by_jax, several = _by_jax(primitive, tuple(params.items())), primitive.multiple_results
 
     def bound(*args: Any) -> Sequence[Any]:
         out = by_jax(*args)
-        return [plain(value) for value in (out if eqn.primitive.multiple_results else [out])]
+        return [plain(value) for value in (out if several else [out])]
 
     return bound
 
 
 def plain(value: Any, dtype: Any = None) -> Any:
     """As an array of NumPy, which has no random keys: those stay what they are."""
-    return value if _is_key(value) else np.asarray(value, dtype)
-
-
-def _is_key(value: Any) -> bool:
-    return jnp.issubdtype(getattr(value, "dtype", np.float64), jax.dtypes.prng_key)
+    kind = getattr(value, "dtype", None)
+    return np.asarray(value, dtype) if kind is None or isinstance(kind, np.dtype) else value
 
 
 def _by_jax(primitive: Any, params: tuple[tuple[str, Any], ...]) -> Callable[..., Any]:
@@ -69,16 +79,9 @@ def _jitted(primitive: Any, params: tuple[tuple[str, Any], ...]) -> Callable[...
     return jax.jit(lambda *args: primitive.bind(*args, **dict(params)))
 
 
-def operator(eqn: Any) -> str | None:
-    """The operation of single numbers as Python writes it."""
-    name, kinds = eqn.primitive.name, [v.aval for v in (*eqn.invars, *eqn.outvars)]
-    if any(kind.shape or _is_key(kind) for kind in kinds):
-        return None
-    if name in _FLOATING_ONLY and kinds[0].dtype.kind != "f":
-        return None
-    if name == "select_n" and kinds[0].dtype != bool:
-        return None
-    return single_numbers(name, kinds[0].dtype)
+def _sign(x: Any) -> Any:
+    """Of a zero, the zero itself."""
+    return np.where(x == 0, x, np.sign(x))
 
 
 def _scale(factor: Any, value: Any) -> Any:
@@ -147,14 +150,61 @@ def _dot(params: Any, a: Any, b: Any) -> Any:
     return (rows(a, (batch_a, free_a, over_a)) @ rows(b, (batch_b, over_b, free_b))).reshape(sizes)
 
 
-def _extreme(function: Callable[..., Any], initial: float) -> Callable[..., Any]:
-    return lambda params, x: function(x, tuple(params["axes"]), initial=initial if x.dtype.kind == "f" else None)
+def _extreme(function: np.ufunc, initial: float) -> Callable[..., Any]:
+    def extreme(params: Any, x: Any) -> Any:
+        first: dict[str, Any] = {"initial": initial} if x.dtype.kind == "f" else {}
+        return function.reduce(x, tuple(params["axes"]), **first)
+
+    return extreme
+
+
+def _sort(axis: int, first: Any, *others: Any) -> Sequence[Any]:
+    """By the first array; equal entries stay in order, NaN come last."""
+    if not others:
+        return (np.sort(first, axis, kind="stable"),)
+    order = np.argsort(first, axis, kind="stable")
+    return [np.take_along_axis(array, order, axis) for array in (first, *others)]
+
+
+def _padded(params: Any, x: Any, value: Any) -> Any:
+    """Negative padding leaves entries out."""
+    config = params["padding_config"]
+    inner = [max(0, size + (size - 1) * between) for size, (_, _, between) in zip(x.shape, config, strict=True)]
+    wide = np.full(
+        [size + max(low, 0) + max(high, 0) for size, (low, high, _) in zip(inner, config, strict=True)], value
+    )
+    at = [
+        slice(max(low, 0), max(low, 0) + size, between + 1)
+        for size, (low, _, between) in zip(inner, config, strict=True)
+    ]
+    wide[tuple(at)] = x
+    ends = zip(wide.shape, config, strict=True)
+    return wide[tuple(slice(max(-low, 0), size - max(-high, 0)) for size, (low, high, _) in ends)]
+
+
+def _updated(params: Any, x: Any, update: Any, *starts: Any) -> Any:
+    """As XLA does: what would leave the array begins earlier."""
+    sizes = update.shape
+    first = [min(max(int(i), 0), all_ - size) for i, all_, size in zip(starts, x.shape, sizes, strict=True)]
+    out = np.array(x)
+    out[tuple(slice(i, i + size) for i, size in zip(first, sizes, strict=True))] = update
+    return out
+
+
+def _index_of(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The first of equal ones, or the first NaN."""
+    return lambda params, x: function(x, params["axes"][0]).astype(params["index_dtype"])
+
+
+def _junction(of_bits: np.ufunc, of_truth: np.ufunc) -> Callable[..., Any]:
+    return lambda params, x: (of_truth if x.dtype == bool else of_bits).reduce(x, tuple(params["axes"]))
 
 
 # Exact, or correctly rounded.
 _ELEMENTWISE: dict[str, Callable[..., Any]] = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative, "abs": np.abs,
-    "max": np.maximum, "min": np.minimum, "larger": np.maximum, "smaller": np.minimum, "sign": np.sign,
+    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
+    "abs": np.abs,
+    "max": np.maximum, "min": np.minimum, "larger": np.maximum, "smaller": np.minimum, "sign": _sign,
     "raised": lambda a, b: np.where(b > a, b, a), "cut": lambda a, b: np.where(b < a, b, a), "floor": np.floor,
     "ceil": np.ceil, "sqrt": np.sqrt, "square": np.square, "is_finite": np.isfinite, "scale": _scale, "times": _times,
     "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal, "ne": np.not_equal,
@@ -163,7 +213,6 @@ _ELEMENTWISE: dict[str, Callable[..., Any]] = {
     **dict.fromkeys(("stop_gradient", "fusion_barrier", "optimization_barrier", "copy"), lambda x: x),
     **dict.fromkeys(("wave", "falling_wave"), lambda value, t, slope: value),
 }  # fmt: skip
-_FLOATING_ONLY = {"div", "sign", "abs", "neg", "sqrt", "square", "floor", "ceil"}
 
 _ARRAYS: dict[str, Callable[..., Any]] = {
     "convert_element_type": lambda params, x: x.astype(params["new_dtype"]),
@@ -180,11 +229,20 @@ _ARRAYS: dict[str, Callable[..., Any]] = {
     "concatenate": lambda params, *x: np.concatenate(x, axis=params["dimension"]),
     "stack": lambda params, *x: np.stack(x, axis=params["axis"]),
     "rev": lambda params, x: np.flip(x, tuple(params["dimensions"])),
-    "reduce_sum": lambda params, x: x.sum(tuple(params["axes"])),
-    "reduce_prod": lambda params, x: x.prod(tuple(params["axes"])),
-    "reduce_and": lambda params, x: x.all(tuple(params["axes"])),
-    "reduce_or": lambda params, x: x.any(tuple(params["axes"])),
-    "reduce_max": _extreme(np.max, -np.inf),
-    "reduce_min": _extreme(np.min, np.inf),
+    "reduce_sum": lambda params, x: np.add.reduce(x, tuple(params["axes"]), x.dtype),
+    "reduce_prod": lambda params, x: np.multiply.reduce(x, tuple(params["axes"]), x.dtype),
+    "reduce_and": _junction(np.bitwise_and, np.logical_and),
+    "reduce_or": _junction(np.bitwise_or, np.logical_or),
+    "reduce_max": _extreme(np.maximum, -np.inf),
+    "reduce_min": _extreme(np.minimum, np.inf),
+    "argmax": _index_of(np.argmax),
+    "argmin": _index_of(np.argmin),
+    "pad": _padded,
+    "dynamic_update_slice": _updated,
     "dot_general": _dot,
+}
+
+_SEVERAL: dict[str, Callable[..., Sequence[Any]]] = {
+    "split": lambda params, x: np.split(x, np.cumsum(params["sizes"])[:-1], axis=params["axis"]),
+    "unstack": lambda params, x: list(np.moveaxis(x, params["axis"], 0)),
 }

@@ -13,9 +13,10 @@ import jax.extend.core as jex
 import numpy as np
 
 from gsisio_jax._collector import rare_collection
-from gsisio_jax.scalar.numpy_operations import numpy_operation, operator, plain
-from gsisio_jax.scalar.numpy_source import Operation, as_code
-from gsisio_jax.scalar.primitive import written
+from gsisio_jax.scalar.numpy_numbers import SAME, add_numbers, has_numbers_of_numpy
+from gsisio_jax.scalar.numpy_operations import numpy_operation, plain
+from gsisio_jax.scalar.numpy_source import Operation, as_code, source
+from gsisio_jax.scalar.primitive import numbers_of, written
 from gsisio_jax.scalar.unroll import called_jaxpr
 
 _CALLS = {
@@ -26,6 +27,9 @@ _MOST_TURNS = 1000  # of a loop: a longer one is worth compiling
 _FEW_RUNS = 6  # a program that runs oftener becomes Python's code, which takes about as long as these
 
 
+_MAYBE_SAME = {"reshape", "squeeze", "expand_dims", "broadcast_in_dim", "convert_element_type"}
+
+
 @rare_collection()
 def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[..., Any]:
     """`function` of pytrees of arrays, traced once for the shapes and types of `example`.
@@ -34,28 +38,20 @@ def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[...,
     matrix product may be taken in any order.
     """
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*example)
-    program, structure = _flat(closed), jax.tree.structure(shape)
+    program, structure = numpy_program(closed), jax.tree.structure(shape)
     return lambda *args: jax.tree.unflatten(structure, program(*jax.tree.leaves(args)))
 
 
-def _flat(closed: Any) -> Callable[..., list[Any]]:
+@rare_collection()
+def numpy_program(closed: Any) -> Callable[..., list[Any]]:
     """The program of a jaxpr: its arguments to its results, arrays all."""
-    program = _Program()
-    inputs = [program.place() for _ in closed.jaxpr.invars]
-    with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
-        outputs = program.add(closed.jaxpr, closed.consts, inputs)
-    program.drop_unused(outputs)
+    program = _Program(closed)
     given, found = ([v.aval.dtype for v in group] for group in (closed.jaxpr.invars, closed.jaxpr.outvars))
-    runs, code = 0, None
 
     def run(*args: Any) -> list[Any]:
-        nonlocal runs, code
-        runs += 1
-        if code is None and runs >= _FEW_RUNS:
-            code = as_code(program.operations, program.values, inputs, outputs)
         leaves = [plain(leaf, dtype)[()] for leaf, dtype in zip(args, given, strict=True)]
         with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
-            values = code(*leaves) if code else program.run(inputs, leaves, outputs)
+            values = program.runner()(leaves)
         return [plain(value, dtype) for value, dtype in zip(values, found, strict=True)]
 
     return run
@@ -64,9 +60,24 @@ def _flat(closed: Any) -> Callable[..., list[Any]]:
 class _Program:
     """Values by their places, None where they are not known yet, and the operations that compute these, in order."""
 
-    def __init__(self) -> None:
+    def __init__(self, closed: Any) -> None:
         self.values: list[Any] = []
         self.operations: list[Operation] = []
+        self.kinds = [v.aval for v in closed.jaxpr.invars]
+        self.inputs = [self.place() for _ in self.kinds]
+        with np.errstate(all="ignore"), jax.ensure_compile_time_eval():
+            self.outputs = self.add(closed.jaxpr, closed.consts, self.inputs)
+        self.drop_unused()
+        self._runs = 0
+        self._code: Any = None
+
+    def runner(self, times: int = 1) -> Callable[[Sequence[Any]], Sequence[Any]]:
+        """What takes leaves to results, for so many more runs; NumPy's types only where it is not code."""
+        self._runs += times
+        if self._code is None and self._runs >= _FEW_RUNS:
+            code = as_code(self.operations, self.values, self.inputs, self.kinds, self.outputs)
+            self._code = lambda leaves: code(*leaves)
+        return self._code or self._run
 
     def place(self, value: Any = None) -> int:
         self.values.append(value)
@@ -85,43 +96,65 @@ class _Program:
 
         for eqn in jaxpr.eqns:
             operands = [of(atom) for atom in eqn.invars]
-            if (function := written(eqn)) is not None:
-                body = jax.make_jaxpr(function)(*(atom.aval for atom in eqn.invars))
-                found = self.add(body.jaxpr, body.consts, operands)
-            elif eqn.primitive.name in _CALLS:
-                found = self.add(*called_jaxpr(eqn), operands)
-            else:
-                found = self._append(eqn, operands)
-            places.update(zip(eqn.outvars, found, strict=True))
+            places.update(zip(eqn.outvars, self.equation(eqn, operands), strict=True))
         return [of(atom) for atom in jaxpr.outvars]
 
-    def drop_unused(self, outputs: Sequence[int]) -> None:
+    def equation(self, eqn: Any, operands: list[int]) -> list[int]:
+        """Append one equation of any kind; places of its results."""
+        if (program := numbers_of(eqn)) is not None and has_numbers_of_numpy(program):
+            return add_numbers(self, program, operands)
+        if (function := written(eqn)) is not None:
+            body = jax.make_jaxpr(function)(*(atom.aval for atom in eqn.invars))
+            return self.add(body.jaxpr, body.consts, operands)
+        if eqn.primitive.name in _CALLS:
+            return self.add(*called_jaxpr(eqn), operands)
+        if _is_same(eqn):
+            return operands[:1]
+        given, found = ([v.aval for v in group] for group in (eqn.invars, eqn.outvars))
+        return self.append(
+            _operation(eqn), operands, given, found, source(eqn.primitive.name, eqn.params, given, found)
+        )
+
+    def drop_unused(self) -> None:
         """Leave operations out whose results nothing needs."""
-        needed, kept = set(outputs), []
+        needed, kept = set(self.outputs), []
         for operation in reversed(self.operations):
             if not needed.isdisjoint(operation.results):
                 needed.update(operation.operands)
                 kept.append(operation)
         self.operations = kept[::-1]
 
-    def run(self, inputs: Sequence[int], leaves: Sequence[Any], outputs: Sequence[int]) -> list[Any]:
+    def _run(self, leaves: Sequence[Any]) -> list[Any]:
         """Operation by operation."""
         values = list(self.values)
-        for place, leaf in zip(inputs, leaves, strict=True):
+        for place, leaf in zip(self.inputs, leaves, strict=True):
             values[place] = leaf
         for operation in self.operations:
-            found = operation.function(*(values[i] for i in operation.operands))
+            found = operation.function(*[values[i] for i in operation.operands])
             for place, value in zip(operation.results, found, strict=True):
                 values[place] = value
-        return [values[i] for i in outputs]
+        return [values[i] for i in self.outputs]
 
-    def _append(self, eqn: Any, operands: list[int]) -> list[int]:
-        known, function = [self.values[i] for i in operands], _operation(eqn)
+    def append(
+        self, function: Callable[..., Sequence[Any]], operands: list[int], given: Sequence[Any], found: Sequence[Any],
+        text: str | None = None,
+    ) -> list[int]:  # fmt: skip
+        """An operation on values of kinds `given`, with results of kinds `found`; at once where its operands are
+        known."""
+        known = [self.values[i] for i in operands]
         if all(value is not None for value in known):
             return [self.place(value) for value in function(*known)]
-        found = [self.place() for _ in eqn.outvars]
-        self.operations.append(Operation(function, operands, found, operator(eqn)))
-        return found
+        results = [self.place() for _ in found]
+        self.operations.append(Operation(function, operands, results, given, found, text))
+        return results
+
+
+def _is_same(eqn: Any) -> bool:
+    name = eqn.primitive.name
+    if name in _MAYBE_SAME:
+        before, after = eqn.invars[0].aval, eqn.outvars[0].aval
+        return len(eqn.invars) == 1 and before.shape == after.shape and before.dtype == after.dtype
+    return name in SAME or (name == "optimization_barrier" and len(eqn.invars) == 1)
 
 
 def _operation(eqn: Any) -> Callable[..., Sequence[Any]]:
@@ -132,18 +165,20 @@ def _operation(eqn: Any) -> Callable[..., Sequence[Any]]:
 def _scan(eqn: Any) -> Callable[..., Sequence[Any]]:
     """Turn by turn: compiled it would be one large program."""
     params = eqn.params
-    turn, length = _flat(params["jaxpr"]), params["length"]
+    body, length = _Program(params["jaxpr"]), params["length"]
     first, kept = params["num_consts"], params["num_carry"]
     order = range(length)[::-1] if params["reverse"] else range(length)
+    kinds = [v.aval for v in eqn.outvars]
 
     def run(*args: Any) -> Sequence[Any]:
         fixed, carry, rows = args[:first], args[first : first + kept], args[first + kept :]
-        stacked = [np.zeros(v.aval.shape, v.aval.dtype) for v in eqn.outvars[kept:]]
+        stacked = [np.zeros(kind.shape, kind.dtype) for kind in kinds[kept:]]
+        turn = body.runner(length)
         for i in order:
-            found = turn(*fixed, *carry, *(row[i] for row in rows))
+            found = turn([*fixed, *carry, *[row[i] for row in rows]])
             carry = found[:kept]
             for column, value in zip(stacked, found[kept:], strict=True):
                 column[i] = value
-        return [*carry, *stacked]
+        return [*(plain(value, kind.dtype) for value, kind in zip(carry, kinds[:kept], strict=True)), *stacked]
 
     return run

@@ -41,6 +41,14 @@ def written(eqn: Any) -> Callable[..., Any] | None:
     return partial(bodies[eqn.primitive], **eqn.params) if eqn.primitive in bodies else None
 
 
+def numbers_of(eqn: Any) -> ScalarProgram | None:
+    """The program of an equation that is one, or its derivative, on single numbers; None for any other."""
+    if eqn.primitive not in (_program, _tangent) or eqn.params["levels"]:
+        return None
+    program = eqn.params["program"]
+    return program if eqn.primitive is _program else tangent_program(program, eqn.params["moving"])
+
+
 def _function(program: ScalarProgram, levels: Levels) -> Callable[..., Any]:
     def plain(*args: Any) -> Any:
         return program(args)

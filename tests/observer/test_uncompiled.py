@@ -10,7 +10,8 @@ import systems
 import target
 from models.gallery import MODELS
 from models.runner import records
-from oracles.uncompiled import FEW, uncompiled
+from oracles import uncompiled as oracle
+from oracles.uncompiled import uncompiled
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
@@ -101,9 +102,11 @@ def test_single_precision_and_steps():
         _same(run(), compiled)
 
 
-@pytest.mark.parametrize("count", [3, FEW + 1])
-def test_batches(count):
+@pytest.mark.parametrize("most", [oracle.MOST_SECONDS, 0])
+def test_batches(most, monkeypatch):
     """One by one, and as arrays."""
+    monkeypatch.setattr(oracle, "MOST_SECONDS", most)
+    count = 3
     observer, initial, y, _ = _s1()
     rows = jnp.asarray(y[:4] + np.linspace(-0.1, 0.1, count)[:, None, None])
     boxes = Interval(*(jnp.linspace(1, 1.2, count)[:, None] * side for side in (initial.lower, initial.upper)))

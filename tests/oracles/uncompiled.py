@@ -18,11 +18,15 @@ import pytest
 from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
 from oracles import uncompiled_calls
-from oracles.uncompiled_calls import FEW, MOST
+from oracles.uncompiled_calls import MOST
 from oracles.uncompiled_calls import in_numpy as in_numpy
 
 from gsisio_jax.observer import estimation
-from gsisio_jax.scalar.numpy_program import numpy_function
+from gsisio_jax.scalar.numpy_program import numpy_function, numpy_program
+from gsisio_jax.scalar.program import ScalarProgram
+
+MOST_SECONDS = 0.5
+"""Records of a batch that take so long at most are run one by one: to trace a step for many takes longer."""
 
 NAMES = ("_estimate", "_start", "_step", "_resume")
 _programs: dict[Any, Callable[..., Any]] = {}
@@ -68,8 +72,7 @@ class _Traced:
         shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
         self.closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
         self.structure = jax.tree.structure(shape)
-        kinds = [v.aval.shape == () for eqn in _equations(self.closed.jaxpr) for v in eqn.outvars]
-        self.of_numbers = np.mean(kinds) > 0.8
+        self.seconds = _seconds(self.closed.jaxpr)
 
     def mapped(self, axes: Sequence[Sequence[int | None]]) -> Callable[..., Sequence[Any]]:
         """As a function of JAX, under as many `jax.vmap` as there are axes."""
@@ -83,22 +86,30 @@ _numpy = jex.Primitive("in_numpy")
 _numpy.multiple_results = True
 
 
-def _equations(jaxpr: Any) -> Iterator[Any]:
+def _seconds(jaxpr: Any) -> float:
+    """What a run takes, about: an operation on a short array one microsecond, one on a number a thirtieth."""
+    total = 0.0
     for eqn in jaxpr.eqns:
-        yield eqn
-        for inner in (param for param in eqn.params.values() if hasattr(param, "jaxpr")):
-            yield from _equations(inner.jaxpr)
+        inner = [param.jaxpr for param in eqn.params.values() if hasattr(param, "jaxpr")]
+        if isinstance(program := eqn.params.get("program"), ScalarProgram):
+            total += 3e-8 * len(program.operations)
+        elif inner:
+            total += eqn.params.get("length", 1) * sum(map(_seconds, inner))
+        else:
+            total += 1e-6
+    return total
 
 
 def _values(args: Sequence[Any], program: _Traced, axes: Any) -> Sequence[Any]:
-    if axes and program.of_numbers and (count := _size(axes[-1], [arg.shape for arg in args])) <= FEW:
+    count = _size(axes[-1], [arg.shape for arg in args]) if axes else 0
+    if count and count * program.seconds <= MOST_SECONDS:
         rows = (
             [arg if axis is None else arg[i] for arg, axis in zip(args, axes[-1], strict=True)] for i in range(count)
         )
         return [np.stack(column) for column in zip(*(_values(row, program, axes[:-1]) for row in rows), strict=True)]
     key = program, axes, tuple(arg.shape for arg in args)
     if key not in _programs:
-        _programs[key] = numpy_function(program.mapped(axes), *args)
+        _programs[key] = numpy_function(program.mapped(axes), *args) if axes else numpy_program(program.closed)
     return _programs[key](*args)
 
 
