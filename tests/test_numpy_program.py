@@ -9,9 +9,10 @@ import pytest
 
 from gsisio_jax.interval.minmax import cut, raised, smaller
 from gsisio_jax.interval.primitives import scale, times
-from gsisio_jax.scalar import call, numpy_program, scan
+from gsisio_jax.scalar import call, numpy_program, scalar_program, scan
 from gsisio_jax.scalar.numpy_program import numpy_function
 from gsisio_jax.scalar.program import ScalarProgram
+from gsisio_jax.scalar.unroll import ArrayOperation
 
 
 def test_a_numpy_program_gives_what_jax_gives():
@@ -163,3 +164,16 @@ def test_programs_of_numbers_are_not_traced_again(dtype, monkeypatch):
             for own, other in zip(program(a, b), jax.tree.leaves(compiled(a, b)), strict=True):
                 assert own.dtype == other.dtype
                 np.testing.assert_allclose(own, other, rtol=4 * np.finfo(own.dtype).eps if own.dtype.kind == "f" else 0)
+
+
+@pytest.mark.parametrize("derivative", [jax.grad, lambda of: lambda x: jax.jvp(of, (x,), (2 * x,))[1]])
+def test_derivatives_of_operations_on_arrays(derivative):
+    """In a program of numbers, where JAX alone knows them."""
+
+    def of(x):
+        return call(lambda x: jnp.sort(jnp.sin(x)) @ jnp.arange(1.0, 4.0) + jnp.cumsum(x**2)[2], x)
+
+    x = np.array([0.7, -1.2, 0.1])
+    operations = scalar_program(jax.make_jaxpr(jnp.sort)(x)).operations
+    assert any(isinstance(number.equation, ArrayOperation) for number in operations)
+    np.testing.assert_allclose(numpy_function(derivative(of), x)(x), jax.jit(derivative(of))(x), rtol=1e-14)

@@ -6,12 +6,14 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
 
+import jax
 import numpy as np
 
 from gsisio_jax.scalar.graph import Number, is_constant
 from gsisio_jax.scalar.numpy_operations import operation_of, plain
 from gsisio_jax.scalar.numpy_source import source
 from gsisio_jax.scalar.program import ScalarProgram, bound
+from gsisio_jax.scalar.unroll import ArrayOperation
 
 SAME = {"stop_gradient", "fusion_barrier", "copy", "wave", "falling_wave"}
 """Operations that leave their first argument as it is."""
@@ -28,6 +30,7 @@ class Operations(Protocol):
     def place(self, value: Any = None) -> int: ...
     def append(self, function: Any, operands: list[int], given: Any, found: Any, text: Any = None) -> list[int]: ...
     def equation(self, eqn: Any, operands: list[int]) -> list[int]: ...
+    def add(self, jaxpr: Any, consts: Sequence[Any], inputs: list[int]) -> list[int]: ...
 
 
 def has_numbers_of_numpy(program: ScalarProgram) -> bool:
@@ -54,7 +57,8 @@ def add_numbers(into: Operations, program: ScalarProgram, inputs: Sequence[int])
     for number in program.operations:
         operands, name = number.operands, number.name
         if name == "array":
-            entries[id(number)] = _array(into, number.equation, operands, of)
+            known = isinstance(number.equation, ArrayOperation)
+            entries[id(number)] = (_array if known else _traced)(into, number.equation, operands, of)
         elif name == "part":
             places[id(number)] = entries[id(operands[0])][number.equation]
         elif name in SAME or (name == "convert_element_type" and operands[0].dtype == number.dtype):
@@ -94,6 +98,18 @@ def _array(into: Operations, operation: Any, flat: Sequence[Any], of: Callable[[
         kinds = [Kind((), dtype)] * math.prod(shape)
         found += into.append(lambda x: [*np.ravel(x)], [place], [Kind(shape, dtype)], kinds)
     return found
+
+
+def _traced(into: Operations, operation: Any, flat: Sequence[Any], of: Callable[[Any], int]) -> list[int]:
+    """The same of one that is JAX's business: a derivative of such an equation."""
+    moving = [value for value in flat if isinstance(value, Number)]
+
+    def entries(*given: Any) -> Any:
+        left = iter(given)
+        return operation([next(left) if isinstance(value, Number) else value for value in flat])
+
+    closed = jax.make_jaxpr(entries)(*(jax.ShapeDtypeStruct((), value.dtype) for value in moving))
+    return into.add(closed.jaxpr, closed.consts, [*map(of, moving)])
 
 
 def _stacked(into: Operations, places: list[int], kinds: list[Any], shape: tuple[int, ...], dtype: Any) -> int:
