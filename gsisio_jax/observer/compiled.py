@@ -14,7 +14,7 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.observer.types import Carry
 from gsisio_jax.plant.system import Noise
-from gsisio_jax.scalar.options import KNOWN, XLA_LOOP_BYTES, jaxlib_version, loop_bytes
+from gsisio_jax.scalar.options import KNOWN, jaxlib_version, loops_are_functions
 
 TASKS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
 """For the compiler of one program over single numbers, with XLA's own settings. XLA's newer way of writing fused
@@ -66,7 +66,7 @@ def _options() -> dict[str, Any]:
     """Empty where XLA_FLAGS say otherwise, this XLA does not have them, or no processor was measured (a GPU)."""
     if jax.default_backend() != "cpu":
         return {}
-    wanted = FUNCTION if loop_bytes() > XLA_LOOP_BYTES else TASKS
+    wanted = FUNCTION if loops_are_functions() else TASKS
     given = os.environ.get("XLA_FLAGS", "")
     return wanted if not any(name in given for name in wanted) and _knows(wanted) else {}
 

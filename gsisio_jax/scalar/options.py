@@ -58,6 +58,11 @@ def loop_bytes() -> int:
     return int(found[-1]) if found else XLA_LOOP_BYTES
 
 
+def loops_are_functions() -> bool:
+    """Do XLA_FLAGS allow the loop over a record to be one function? Programs are then compiled with other options."""
+    return loop_bytes() > XLA_LOOP_BYTES
+
+
 def extended(given: str) -> str:
     """XLA_FLAGS with `FLAGS` behind those that are given; what is set already stays as it is.
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from gsisio_jax._collector import rare_collection
-from gsisio_jax.scalar.options import XLA_LOOP_BYTES, loop_bytes
+from gsisio_jax.scalar.options import loops_are_functions
 from gsisio_jax.scalar.primitive import run
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
 from gsisio_jax.scalar.unroll import numbers_in
@@ -97,7 +97,7 @@ def in_tasks(step: Callable[..., Any]) -> Callable[..., Any]:
     over arrays they multiply from sum to sum: a step of four states with 28 gains took more than 20 GB to compile. A
     loop that sorts stays a sequence of tasks.
     """
-    if loop_bytes() <= XLA_LOOP_BYTES:
+    if not loops_are_functions():
         return step
 
     def turn(carry: Any, row: Any) -> tuple[Any, Any]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from gsisio_jax.scalar.options import XLA_LOOP_BYTES, loop_bytes
+from gsisio_jax.scalar.options import loops_are_functions
 
 # For the compiler of one program; nothing global is changed. The numbers are the same up to rounding.
 FUNCTION: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
@@ -22,4 +22,4 @@ def quickly(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
     """`jax.jit`, for a program whose compilation costs more than its run; on CPU only, elsewhere as usual."""
     if jax.default_backend() != "cpu":
         return jax.jit(function, **options)
-    return jax.jit(function, compiler_options=FUNCTION if loop_bytes() > XLA_LOOP_BYTES else TASKS, **options)
+    return jax.jit(function, compiler_options=FUNCTION if loops_are_functions() else TASKS, **options)
