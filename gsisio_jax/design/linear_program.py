@@ -41,9 +41,8 @@ class Expression:
         lead, offset = self.shape[:-1], self.offset @ matrix
         if not self.offset.size or not offset.size:
             return Expression(sparse.csr_array((offset.size, self.rows.shape[1])), offset)
-        right = np.reshape(matrix, (self.shape[-1], -1)).T
-        rows = sparse.csr_array(sparse.kron(sparse.eye_array(int(np.prod(lead))), sparse.csr_array(right)))
-        return Expression(rows @ self.rows, offset)
+        right = sparse.csr_array(np.reshape(matrix, (self.shape[-1], -1)).T)
+        return Expression(_along_diagonal(right, int(np.prod(lead))) @ self.rows, offset)
 
     def __add__(self, other: Any) -> Expression:
         if not isinstance(other, Expression):
@@ -68,8 +67,7 @@ class Expression:
         order = np.arange(self.offset.size).reshape(self.shape)
         groups = order.reshape(1, -1) if axis is None else np.moveaxis(order, axis, -1)
         groups = groups.reshape(-1, groups.shape[-1])
-        place = np.repeat(np.arange(len(groups)), groups.shape[1])
-        add = sparse.csr_array((np.ones(groups.size), (place, groups.ravel())), (len(groups), self.offset.size))
+        add = _ones(groups.ravel(), groups.shape[1] * np.arange(len(groups) + 1), self.offset.size)
         return Expression(add @ self.rows, np.asarray(self.offset.sum(axis)))
 
 
@@ -85,9 +83,7 @@ class LinearProgram:
         """New unknowns."""
         size, start = int(np.prod(shape)), self._count
         self._count += size
-        place = np.arange(size)
-        rows = sparse.csr_array((np.ones(size), (place, start + place)), (size, self._count))
-        return Expression(rows, np.zeros(shape))
+        return Expression(_ones(start + np.arange(size), np.arange(size + 1), self._count), np.zeros(shape))
 
     def absolute(self, value: Any) -> Any:
         """Numbers at or above the absolute values of an expression."""
@@ -128,8 +124,21 @@ class LinearProgram:
 def diagonal(values: Expression) -> Expression:
     """The diagonal matrix of a vector."""
     n = values.shape[0]
-    place = sparse.csr_array((np.ones(n), (np.arange(n) * (n + 1), np.arange(n))), (n * n, n))
+    place = _ones(np.arange(n), (np.arange(n * n + 1) + n) // (n + 1), n)
     return Expression(place @ values.rows, np.diag(values.offset))
+
+
+def _ones(columns: np.ndarray, ends: np.ndarray, width: int) -> Any:
+    """Rows with ones at these columns, row r at those from ends[r] to ends[r+1]: SciPy's forms by coordinates sort."""
+    return sparse.csr_array((np.ones(len(columns)), columns, ends), (len(ends) - 1, width))
+
+
+def _along_diagonal(block: Any, count: int) -> Any:
+    """`count` copies of a sparse matrix along the diagonal of a larger one."""
+    (height, width), copies = block.shape, np.arange(count)[:, None]
+    columns = (block.indices + width * copies).ravel()
+    ends = np.append((block.indptr[:-1] + block.nnz * copies).ravel(), block.nnz * count)
+    return sparse.csr_array((np.tile(block.data, count), columns, ends), (height * count, width * count))
 
 
 def _wide(rows: Any, width: int) -> Any:

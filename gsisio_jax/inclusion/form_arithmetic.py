@@ -5,6 +5,9 @@ Source: theory 9 and 10.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import jax
@@ -38,7 +41,39 @@ def fold(call: Any, *values: Any) -> Any:
     operation for every new shape."""
     if not all(is_known(value) for value in values):
         return call(*values)
-    return numpy_function(call, *values)(*values)
+    kinds = tuple((value.shape, value.dtype) for value in values)
+    try:
+        hash(call)
+    except TypeError:  # parameters, or what it holds, have no hash
+        return numpy_function(call, *values)(*values)
+    return _folded(call, kinds, bool(jax.config.jax_enable_x64))(*values)
+
+
+@lru_cache(512)
+def _folded(call: Callable[..., Any], kinds: tuple[Any, ...], wide: bool) -> Callable[..., Any]:
+    """The program of equal calls is made once: both sides of a box, and every map that has this operation, share it."""
+    return numpy_function(call, *(jax.ShapeDtypeStruct(*kind) for kind in kinds))
+
+
+@dataclass(frozen=True)
+class Operation:
+    """A primitive on its arguments; equal to another one that does the same."""
+
+    primitive: Any
+    params: tuple[tuple[str, Any], ...]
+
+    def __call__(self, *values: Any) -> Any:
+        return self.primitive.bind(*map(jnp.asarray, values), **dict(self.params))
+
+
+@dataclass(frozen=True)
+class Along:
+    """`jax.vmap` of a function; equal to that of an equal function."""
+
+    function: Callable[..., Any]
+
+    def __call__(self, *values: Any) -> Any:
+        return jax.vmap(self.function)(*values)
 
 
 def is_point(a: Interval) -> bool:

@@ -21,7 +21,7 @@ from jax.core import Tracer
 
 from gsisio_jax.inclusion import one_variable
 from gsisio_jax.inclusion.by_hand import BY_HAND, apply_by_hand
-from gsisio_jax.inclusion.form_arithmetic import fold, is_known, known_if_concrete
+from gsisio_jax.inclusion.form_arithmetic import Operation, fold, is_known, known_if_concrete
 from gsisio_jax.inclusion.loops import kept_loop, stack
 from gsisio_jax.inclusion.node import as_node, is_node, normalise, normalised
 from gsisio_jax.inclusion.origin import remember, settled
@@ -152,7 +152,7 @@ def _constant(eqn: Any, args: Sequence[Any]) -> Any:
         nodes = [as_node(arg, jnp.shape(arg), out.dtype) for arg in args]
         aligned = nodes if name in REDUCTIONS else _aligned(nodes, out.shape)
         return normalise((REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned))
-    return fold(lambda *a: eqn.primitive.bind(*(jnp.asarray(v) for v in a), **eqn.params), *args)
+    return fold(Operation(eqn.primitive, tuple(eqn.params.items())), *args)
 
 
 def _aligned(args: Sequence[Any], shape: tuple[int, ...]) -> list[Any]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from gsisio_jax.inclusion import combinations
 from gsisio_jax.inclusion.form_arithmetic import (
+    Along,
     added_slack,
     box_sum,
     fold,
@@ -90,7 +91,7 @@ def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[An
             upper = lower
         return [Interval.unchecked(a, b) for a, b in zip(as_list(lower), as_list(upper), strict=True)]
 
-    along = jax.vmap(fn)
+    along = Along(fn)
     ranges: list[Any] = [] if linear else both([v.range for v in nodes], fn)
     forms: list[Any] = [None] * len(ranges)
     if box is not None:

@@ -15,6 +15,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.inclusion.form_arithmetic import Operation
 from gsisio_jax.inclusion.node import Node, is_node, normalised
 from gsisio_jax.inclusion.origin import made_by, same
 from gsisio_jax.inclusion.rules import (
@@ -66,6 +67,7 @@ def _structural(*data: int, terms: Callable[[Any], int] = lambda eqn: 1, moving:
             if moving is not None:
                 return moving(eqn, *args)
             raise UnknownPrimitiveError(eqn.primitive.name, "with indices that depend on the box")
+        rest = [arg for i, arg in enumerate(args) if i not in where]
         fixed = list(args)
 
         def call(*values: Any) -> Any:
@@ -73,8 +75,8 @@ def _structural(*data: int, terms: Callable[[Any], int] = lambda eqn: 1, moving:
                 fixed[i] = value
             return eqn.primitive.bind(*fixed, **eqn.params)
 
-        rest = [arg for i, arg in enumerate(args) if i not in where]
-        nodes = linear.structural(call, [args[i] for i in where], rest, terms(eqn))
+        whole = call if rest else Operation(eqn.primitive, tuple(eqn.params.items()))
+        nodes = linear.structural(whole, [args[i] for i in where], rest, terms(eqn))
         return nodes if eqn.primitive.multiple_results else nodes[0]
 
     return rule
