@@ -1,6 +1,7 @@
 """The reference results are double precision; float32 is tested by float32 inputs."""
 
 import gc
+import time
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any
@@ -43,12 +44,18 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
             terminalreporter.line(f"{spent:7.1f} s  {name}")
 
 
+_MOST_SECONDS = 15.0  # of tests between two clearings, which take a third of a second each
+_cleared = [time.process_time()]
+
+
 @pytest.fixture(scope="module", autouse=True)
 def little_memory() -> Iterator[None]:
     """No module needs the programs of another one; kept, they take gigabytes, and ever longer collections."""
     yield
-    jax.clear_caches()
-    gc.collect()
+    if time.process_time() - _cleared[0] > _MOST_SECONDS:
+        jax.clear_caches()
+        gc.collect()
+        _cleared[0] = time.process_time()
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -54,15 +55,30 @@ def blank(observer: AnyObserver, initial: Interval) -> Carry:
 
 def advance(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
     """One step of the recursion that belongs to this kind of observer."""
-    return _advance(*fixed(observer), carry, y, u, noise, hold)
+    return _advance(*fixed(as_it_steps(observer)), carry, y, u, noise, hold)
 
 
 # Inlined, so programs are as if this were a plain function; but what JAX traced of a step once serves every batch, scan
 # and study of that observer.
-@partial(jax.jit, static_argnames=("static", "hold"), inline=True)
+@partial(jax.jit, static_argnames=("static", "hold"))
 def _advance(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
     return _module(observer).advance(observer, carry, y, u, noise, hold)
+
+
+def as_it_steps(observer: AnyObserver) -> AnyObserver:
+    """The observer without what its certificates say of lost rows, which no step reads: the design has tried a step to
+    find that out, so the first call need not trace it again."""
+    found = vars(observer).get("_as_it_steps")
+    if found is None:
+        changed: dict[str, Any] = {}
+        if not isinstance(observer, TolerantObserver):
+            changed["certificate"] = observer.certificate.without_recovery()
+        if isinstance(observer, DelayedObserver | TolerantObserver):
+            changed["inner"] = as_it_steps(observer.inner)
+        found = replace(observer, **changed)
+        object.__setattr__(observer, "_as_it_steps", found)
+    return found
 
 
 def begin(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
