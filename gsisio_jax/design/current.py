@@ -96,7 +96,7 @@ def design_current(
     first = first_gain(plan, on, box, dials.certify)
     problem, main = first.problem, first.gain
     say("bounding unknown inputs")
-    maps = None if system.periodic_states else AffineMaps.of(system, feedthrough.T2, np.float64)
+    maps = AffineMaps.of(on.maps, system.state_bounds)
     outputs, slack = on.outputs(system.state_bounds)
 
     def assembled(gains: list[np.ndarray], scale: np.ndarray) -> Observer:

@@ -18,6 +18,9 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.cast import cast_known
 from gsisio_jax.scalar.numpy_program import numpy_function
 
+BoundsOfBox = Callable[[Interval], tuple[AffineForm, np.ndarray]]
+"""Affine bounds of a function of x on a box, and the slack of their slope."""
+
 
 class Slopes(eqx.Module):
     """``df in F +- F_radius``, ``dg in E +- E_radius``, ``d(T2 g) in Z +- Z_radius`` on a box, jointly bounded.
@@ -63,19 +66,27 @@ def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) ->
     """Enclosures of the Jacobians as a function of the box (and of that of u), uniformly over `u_box` where no other is
     given; traced once for all boxes, run in NumPy, and computed in that type whatever JAX is set to."""
 
-    def enclose(box: Interval, u: Interval) -> list[Interval]:
-        T2_array = jnp.asarray(np.asarray(T2), dtype)
-        maps = (system.dynamics, system.measurement, lambda x, u: T2_array @ system.measurement(x, u))
-        return [inclusion.jacobian(q)(box, u) for q in maps]
-
-    program = _traced_once(enclose)
+    program = _traced_once(inclusion.jacobian(all_maps(system, T2, dtype)))
+    ends = np.cumsum([system.n, system.l])
 
     def on(box: Interval, u: Interval = u_box) -> Slopes:
         with _able_to_hold(dtype):
-            parts = [_center_and_distance(jacobian) for jacobian in program(known(box, dtype), known(u, dtype))]
-        return Slopes(*parts[0], *parts[1], *parts[2])
+            center, radius = _center_and_distance(program(known(box, dtype), known(u, dtype)))
+        F, E, Z = zip(np.split(center, ends), np.split(radius, ends), strict=True)
+        return Slopes(*F, *E, *Z)
 
     return on
+
+
+def all_maps(system: Any, T2: Any, dtype: Any) -> Callable[[Any, Any], Any]:
+    """[f; g; T2 g] of x and u, (n + l + q,): what they have in common is traced once."""
+    matrix = np.asarray(T2, dtype)
+
+    def maps(x: Any, u: Any) -> Any:
+        g = system.measurement(x, u)
+        return jnp.concatenate([system.dynamics(x, u), g, matrix @ g])
+
+    return maps
 
 
 class Enclosures(NamedTuple):
@@ -84,14 +95,26 @@ class Enclosures(NamedTuple):
     Attributes:
         slopes: from `slopes_of`.
         outputs: from `outputs_of`.
+        maps: from `affine_maps_of`.
     """
 
     slopes: Callable[..., Slopes]
-    outputs: Callable[[Interval], tuple[AffineForm, np.ndarray]]
+    outputs: BoundsOfBox
+    maps: BoundsOfBox | None
 
     @staticmethod
-    def of(system: Any, T2: Any, u_region: Interval) -> Enclosures:
-        return Enclosures(slopes_of(system, T2, u_region), outputs_of(system, T2, u_region))
+    def of(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> Enclosures:
+        maps = affine_maps_of(system, T2, dtype)
+        outputs = outputs_of(system, T2, u_region, dtype) if maps is None else _last_rows(maps, system.n + system.l)
+        return Enclosures(slopes_of(system, T2, u_region, dtype), outputs, maps)
+
+
+def _last_rows(bounds: BoundsOfBox, first: int) -> BoundsOfBox:
+    def on(box: Interval) -> tuple[AffineForm, np.ndarray]:
+        form, slack = bounds(box)
+        return jax.tree.map(lambda side: side[first:], form), slack[first:]
+
+    return on
 
 
 def known(box: Interval, dtype: Any) -> Interval:
@@ -128,9 +151,7 @@ def _center_and_distance(jacobian: Interval) -> tuple[np.ndarray, np.ndarray]:
     return center, np.where(lower == upper, 0.0, np.nextafter(radius, np.inf))
 
 
-def outputs_of(
-    system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64
-) -> Callable[[Interval], tuple[AffineForm, np.ndarray]]:
+def outputs_of(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> BoundsOfBox:
     """Affine bounds of T2 g on a box of states, uniformly over `u_region`, and the slack of their slope (q, n): every
     step begins with those on the state bounds.
 
@@ -140,9 +161,16 @@ def outputs_of(
     return affine_of(lambda x, u: matrix @ system.measurement(x, u), u_region, dtype)
 
 
-def affine_of(
-    function: Callable[..., Any], u_region: Interval, dtype: Any
-) -> Callable[[Interval], tuple[AffineForm, np.ndarray]]:
+def affine_maps_of(system: Any, T2: Any, dtype: Any) -> BoundsOfBox | None:
+    """Affine bounds of [f; g; T2 g] on a box of states; None where they take u, or angles come back to where they
+    were."""
+    if system.takes_u or system.periodic_states:
+        return None
+    nothing = np.zeros(system.m, dtype)
+    return affine_of(all_maps(system, T2, dtype), Interval.unchecked(nothing, nothing), dtype)
+
+
+def affine_of(function: Callable[..., Any], u_region: Interval, dtype: Any) -> BoundsOfBox:
     """Affine bounds of a function of x and u as a function of the box of x, uniformly over `u_region`, and the slack of
     their slope (q, n); traced once for all boxes, as in `slopes_of`, and computed once for each."""
     program = _traced_once(affine_with_slack(function))

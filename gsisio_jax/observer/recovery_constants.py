@@ -11,11 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer.enclosures import affine_of
+from gsisio_jax.observer.enclosures import BoundsOfBox
 from gsisio_jax.observer.recovery import Recovery
 
 _UP = 1 + 1e-9  # covers float64 sums of nonnegative numbers
@@ -34,18 +33,11 @@ class AffineMaps:
     radius: np.ndarray
 
     @classmethod
-    def of(cls, system: Any, T2: Any, dtype: Any) -> AffineMaps | None:
-        """None where they have no such bounds, or take u."""
-        if system.takes_u:
+    def of(cls, bounds: BoundsOfBox | None, state_bounds: Interval) -> AffineMaps | None:
+        """From `affine_maps_of`; None where there are no such bounds."""
+        if bounds is None:
             return None
-        T2 = np.asarray(T2, dtype)
-
-        def maps(x: Any, u: Any) -> Any:
-            f, g = system.dynamics(x, u), system.measurement(x, u)
-            return jnp.concatenate([f, g, T2 @ g])
-
-        nothing = np.zeros(system.m, dtype)
-        form, slack = affine_of(maps, Interval.unchecked(nothing, nothing), dtype)(system.state_bounds)
+        form, slack = bounds(state_bounds)
         slope, lower, upper = (np.asarray(x, np.float64) for x in (form.slope, form.offset.lower, form.offset.upper))
         if not all(np.isfinite(x).all() for x in (slope, slack, lower, upper)):
             return None

@@ -19,7 +19,7 @@ from gsisio_jax.inclusion.transforms import AffineForm
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.certificate import Certificate, spectral_radius
-from gsisio_jax.observer.enclosures import Slopes, known, outputs_of, slopes_of
+from gsisio_jax.observer.enclosures import Enclosures, Slopes, known
 from gsisio_jax.observer.recovery_constants import AffineMaps, with_constants
 from gsisio_jax.observer.residuals import (
     cancellation_residual,
@@ -71,13 +71,12 @@ def single_precision(observer: Observer) -> Observer:
     system = observer.system
     u_region = observer.u_region if system.takes_u else Interval(np.zeros(system.m), np.zeros(system.m))
 
-    slopes = slopes_of(system, narrow.T2, u_region, np.float32)
-    region = slopes(observer.certificate.region)
-    affine = AffineMaps.of(system, narrow.T2, np.float32) if observer.recovery else None
-    outputs = outputs_of(system, narrow.T2, u_region, np.float32)
+    on = Enclosures.of(system, narrow.T2, u_region, np.float32)
+    region = on.slopes(observer.certificate.region)
+    affine = AffineMaps.of(on.maps, system.state_bounds) if observer.recovery else None
     found = with_rounding_constants(
-        narrow, system, region, slopes(system.state_bounds), *outputs(system.state_bounds),
-        affine, np.float32, _slices(narrow, slopes),
+        narrow, system, region, on.slopes(system.state_bounds), *on.outputs(system.state_bounds),
+        affine, np.float32, _slices(narrow, on.slopes),
     )  # fmt: skip
     return jax.tree.map(lambda x: jnp.asarray(x, np.float32), found)
 
