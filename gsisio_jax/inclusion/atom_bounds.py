@@ -44,6 +44,7 @@ from gsisio_jax.inclusion.rules.sincos import LIMIT
 from gsisio_jax.inclusion.rules.trig import Wave, wave_atom
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, nan_to_unbounded
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.primitives import scale
 
 
@@ -112,7 +113,7 @@ class BoxOfAtoms:
             a, b = t.range.lower, t.range.upper
             line = LINES[curve](a, b, kappa) if curve in LINES else line_of(curve, a, b, kappa)
         steep = abs(line.slope)
-        lost = jnp.where(line.usable, jax.lax.stop_gradient(t.size), 0) + flushed(t.size)
+        lost = where(line.usable, jax.lax.stop_gradient(t.size), 0) + flushed(t.size)
         lost = line.size + steep * lost
         pad = padding(lost, line.ulps + 4 * kappa, line.floor)
         half = line.half if rounding.outward() else jnp.maximum(line.half, 0)
@@ -122,7 +123,7 @@ class BoxOfAtoms:
         usable, center, radius, size = chosen(
             line.usable, line.slope * t.center + line.middle, radius, pad, lost, line.range, kappa, flat, best
         )
-        s = jnp.where(usable, line.slope, 0)
+        s = where(usable, line.slope, 0)
         slope = [v if is_zero(v) else s * v for v in t.slope]
         return BoundedAtom(slope, center, radius, line.range, size=size)
 
@@ -130,7 +131,7 @@ class BoxOfAtoms:
         """``x y`` around both centers."""
         kappa = 2.0 * self.terms + 16
         usable, cx, cy, spread, natural = bilinear_line(x.range, y.range, kappa)
-        size_x, size_y = (jnp.where(usable, jax.lax.stop_gradient(t.size), 0) + flushed(t.size) for t in (x, y))
+        size_x, size_y = (where(usable, jax.lax.stop_gradient(t.size), 0) + flushed(t.size) for t in (x, y))
         size = size_x * size_y
         pad = padding(size, 32.0 + 8 * kappa, rounding.FLUSHED)
         center, radius = cy * x.center + cx * y.center - cx * cy, spread
@@ -138,7 +139,7 @@ class BoxOfAtoms:
             radius = radius if t.plain else radius + scale(abs(c), t.radius)
         plain = x.plain and y.plain
         usable, center, radius, size = chosen(usable, center, radius, pad, size, natural, kappa, not plain, not plain)
-        cx, cy = jnp.where(usable, cx, 0), jnp.where(usable, cy, 0)
+        cx, cy = where(usable, cx, 0), where(usable, cy, 0)
         slope = []
         for v, w in zip(x.slope, y.slope, strict=True):
             terms = [c * part for c, part in ((cy, v), (cx, w)) if not is_zero(part)]
@@ -221,7 +222,7 @@ def _wave_line(curve: Wave, t: Argument, terms: int) -> Line:
     """A sine or cosine as a `Line` of an argument that is not linear in the states."""
     a, b = t.range.lower, t.range.upper
     m, r = 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
-    size = jnp.where(jnp.isfinite(t.size), t.size, jnp.inf)
+    size = where(jnp.isfinite(t.size), t.size, jnp.inf)
     slope, center, radius, natural, _ = wave_atom(curve.cosine, m, r, size, terms)
     usable = size < LIMIT[m.dtype.name]
     return Line(usable, slope, center, radius, _wave_size(curve, size), natural)

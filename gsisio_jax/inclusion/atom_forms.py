@@ -16,6 +16,7 @@ from gsisio_jax.inclusion.atoms import States, widened_atoms
 from gsisio_jax.inclusion.node import Form, InputBox, Node
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, nan_to_unbounded
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import scale
 
@@ -122,13 +123,13 @@ def chosen(
     middle, half = np.zeros((), size.dtype), np.asarray(np.inf, size.dtype)
     if flat:
         half = 0.5 * upper - 0.5 * lower
-        middle = jnp.where(half < jnp.inf, 0.5 * lower + 0.5 * upper, 0)
+        middle = where(half < jnp.inf, 0.5 * lower + 0.5 * upper, 0)
         # Its own rounding, and rows of it.
         half = half + padding(far, 2 * kappa + 8, rounding.FLUSHED)
         if best:
             usable = usable & (radius <= half + pad)
-    center, radius = jnp.where(usable, center, middle), jnp.where(usable, radius + pad, half)
-    return usable, center, radius, jnp.where(usable, 4 * size, 2 * far)
+    center, radius = where(usable, center, middle), where(usable, radius + pad, half)
+    return usable, center, radius, where(usable, 4 * size, 2 * far)
 
 
 def met_with_form(natural: Interval, slope: list[Any], center: Any, radius: Any, states: States) -> Interval:

@@ -21,6 +21,7 @@ import numpy as np
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, center_and_radius
+from gsisio_jax.interval.direct import multiple_and_more, where
 from gsisio_jax.interval.image import faint, plain_sums
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
@@ -72,13 +73,13 @@ def wider(size: Any, terms: int) -> Any:
     info = jnp.finfo(size.dtype)
     kind = np.dtype(size.dtype).type
     kappa, floor = kind((2 * terms + 16) * float(info.eps)), kind(rounding.FLUSHED * float(info.tiny))
-    return jax.lax.stop_gradient(size) * kappa + floor
+    return multiple_and_more(jax.lax.stop_gradient(size), kappa, floor)
 
 
 def of_constant(constant: Any) -> Any:
     """What a constant of a row is off by; nothing where it is 0."""
     size = jnp.asarray(abs(constant))
-    return jnp.where(size == 0, 0, wider(size, 0))
+    return where(size == 0, 0, wider(size, 0))
 
 
 class Rows(eqx.Module):
@@ -107,7 +108,7 @@ class Rows(eqx.Module):
             return error
         far = jnp.maximum(abs(atoms.range.lower), abs(atoms.range.upper))
         size = scale(abs(atoms.slope), states.magnitude).sum(-1) + abs(atoms.center) + atoms.radius
-        size = jnp.maximum(size, jnp.where(jnp.isfinite(far), far, 0))
+        size = jnp.maximum(size, where(jnp.isfinite(far), far, 0))
         of_states, of_atoms = self.lost
         return error + wider(
             scale(of_states, states.magnitude).sum(-1) + scale(of_atoms, size).sum(-1), self.atoms.shape[-1]
@@ -145,8 +146,8 @@ def widened_atoms(slope: Any, offset: Interval, natural: Interval, states: State
     center, radius = offset.center, offset.radius
     size = scale(abs(slope), states.magnitude).sum(-1) + abs(center) + radius
     far = jnp.maximum(abs(natural.lower), abs(natural.upper))
-    error = wider(jnp.where(jnp.isfinite(far), far, 0), terms)
+    error = wider(where(jnp.isfinite(far), far, 0), terms)
     # The radius of an interval is itself rounded.
-    radius = radius + wider(jnp.where(jnp.isfinite(size), size, 0), terms)
-    radius = jnp.where(jnp.isfinite(size), radius, jnp.inf)
+    radius = radius + wider(where(jnp.isfinite(size), size, 0), terms)
+    radius = where(jnp.isfinite(size), radius, jnp.inf)
     return AtomBounds(slope, center, radius, Interval.unchecked(natural.lower - error, natural.upper + error))

@@ -17,6 +17,7 @@ from jax.core import Tracer
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, nan_to_unbounded
+from gsisio_jax.interval.direct import absolute, minus, plus, where
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import add_up, times
 from gsisio_jax.scalar.numpy_program import numpy_function
@@ -95,8 +96,8 @@ def box_sum(a: Interval, b: Interval) -> Interval:
         return Interval.unchecked(
             lower, upper if is_point(a) and is_point(b) else rounding.known_sum(a.upper, b.upper)[1]
         )
-    lower = a.lower + b.lower
-    upper = lower if is_point(a) and is_point(b) else a.upper + b.upper
+    lower = plus(a.lower, b.lower)
+    upper = lower if is_point(a) and is_point(b) else plus(a.upper, b.upper)
     return Interval.unchecked(rounding.down(lower), rounding.up(upper))
 
 
@@ -108,7 +109,7 @@ def scaled(factor: Any, a: Interval, ulps: float = 2.0) -> Interval:
         value = times(factor, a.lower)
         return Interval.unchecked(rounding.down(value, ulps), rounding.up(value, ulps))
     up = factor >= 0
-    lower, upper = times(factor, jnp.where(up, a.lower, a.upper)), times(factor, jnp.where(up, a.upper, a.lower))
+    lower, upper = times(factor, where(up, a.lower, a.upper)), times(factor, where(up, a.upper, a.lower))
     return Interval.unchecked(rounding.down(lower, ulps), rounding.up(upper, ulps))
 
 
@@ -118,14 +119,14 @@ def _scaled_by_known(factor: Any, a: Interval, ulps: float) -> Interval:
         return _known_multiple(factor, a)
 
     def multiple(value: Any) -> Any:
-        return jnp.where(factor == 0, 0, factor * value) if (factor == 0).any() else factor * value
+        return where(factor == 0, 0, factor * value) if (factor == 0).any() else factor * value
 
     def bounds(lower: Any, upper: Any) -> Interval:
         if ulps == 2.0 and is_exact(factor):
             return Interval.unchecked(lower, upper)
         low, high = rounding.down(lower, ulps), rounding.up(upper, ulps)
         if rounding.outward() and (factor == 0).any():
-            low, high = jnp.where(factor == 0, 0, low), jnp.where(factor == 0, 0, high)
+            low, high = where(factor == 0, 0, low), where(factor == 0, 0, high)
         return Interval.unchecked(low, high)
 
     if is_point(a):
@@ -136,7 +137,7 @@ def _scaled_by_known(factor: Any, a: Interval, ulps: float) -> Interval:
         return bounds(multiple(a.lower), multiple(a.upper))
     if not up.any():
         return bounds(multiple(a.upper), multiple(a.lower))
-    return bounds(multiple(jnp.where(up, a.lower, a.upper)), multiple(jnp.where(up, a.upper, a.lower)))
+    return bounds(multiple(where(up, a.lower, a.upper)), multiple(where(up, a.upper, a.lower)))
 
 
 def _known_multiple(factor: Any, a: Interval) -> Interval:
@@ -161,14 +162,14 @@ def finite_numbers(*values: Any) -> bool:
 def known_times(factor: Any, first: Any, last: Any) -> Any:
     """``factor`` times `first` where it is positive, times `last` where it is negative, and 0 where it is 0."""
     up = factor >= 0
-    value = first if up.all() else last if not up.any() else jnp.where(up, first, last)
+    value = first if up.all() else last if not up.any() else where(up, first, last)
     product = jnp.broadcast_to(value, factor.shape) if (factor == 1).all() else factor * value
-    return jnp.where(factor == 0, 0, product) if (factor == 0).any() else product
+    return where(factor == 0, 0, product) if (factor == 0).any() else product
 
 
 def spare(exact: Any, radius: Any) -> Any:
     """Nothing for exact rows, even where they are infinite."""
-    return jnp.where(exact, 0, radius) if exact.any() else radius
+    return where(exact, 0, radius) if exact.any() else radius
 
 
 def product(a: Interval, b: Interval) -> Interval:
@@ -197,17 +198,18 @@ def slope_image(slope: Any, box: Any) -> Interval:
 def slope_magnitude(slope: Any, box: Any) -> Any:
     """``sum |slope| magnitude``, to nearest; ``0 * inf = 0``."""
     far = jnp.reshape(box.magnitude, (-1,) + (1,) * (slope.ndim - 1))
-    size = abs(slope)
+    size = absolute(slope)
     no_zero = is_known(size) and size.all()
-    terms = size * far if no_zero else jnp.where(size == 0, 0, size * far)
+    terms = size * far if no_zero else where(size == 0, 0, size * far)
     return add_up(jax.lax.stop_gradient(terms), 0)
 
 
 def loosened(a: Interval, radius: Any, ulps: float = 2.0) -> Interval:
     """The box, `radius` larger on either side, which is itself known to some `ulps`."""
-    lower, upper = a.lower - radius, a.upper + radius
+    lower, upper = minus(a.lower, radius), plus(a.upper, radius)
     return Interval.unchecked(
-        rounding.lowered(lower, abs(a.lower) + radius, ulps), rounding.raised(upper, abs(a.upper) + radius, ulps)
+        rounding.lowered(lower, plus(absolute(a.lower), radius), ulps),
+        rounding.raised(upper, plus(absolute(a.upper), radius), ulps),
     )
 
 
@@ -232,9 +234,9 @@ def scaled_slack(factor: Any, slope: Any, product: Any, slack: Any, ulps: float 
         return sum_slack(before)
     if before is not None:
         # A slack that is flushed to zero would be lost for good, however far the box reaches.
-        before = before + jax.lax.stop_gradient(jnp.where((factor == 0) | (slack == 0), 0, kind(info.tiny)))
+        before = before + jax.lax.stop_gradient(where((factor == 0) | (slack == 0), 0, kind(info.tiny)))
     lost = abs(product) * kind(ulps * info.eps) + kind(info.tiny)
-    return sum_slack(jax.lax.stop_gradient(jnp.where((factor == 0) | (slope == 0), 0, lost)), before)
+    return sum_slack(jax.lax.stop_gradient(where((factor == 0) | (slope == 0), 0, lost)), before)
 
 
 def added_slack(a: Any, b: Any, total: Any) -> Any:
@@ -246,7 +248,7 @@ def added_slack(a: Any, b: Any, total: Any) -> Any:
         return high - low
     kind = np.dtype(total.dtype).type
     lost = abs(total) * kind(2 * jnp.finfo(total.dtype).eps)
-    return jax.lax.stop_gradient(jnp.where((a == 0) | (b == 0), 0, lost))
+    return jax.lax.stop_gradient(where((a == 0) | (b == 0), 0, lost))
 
 
 def guard(a: Interval) -> Interval:
@@ -258,5 +260,5 @@ def guard(a: Interval) -> Interval:
     largest = jnp.finfo(a.lower.dtype).max
     # Chosen, not clipped: the derivative of a minimum is ten operations.
     return Interval.unchecked(
-        jnp.where(a.lower == jnp.inf, largest, a.lower), jnp.where(a.upper == -jnp.inf, -largest, a.upper)
+        where(a.lower == jnp.inf, largest, a.lower), where(a.upper == -jnp.inf, -largest, a.upper)
     )

@@ -31,6 +31,7 @@ from gsisio_jax.inclusion.known_boxes import by_numpy
 from gsisio_jax.inclusion.pointwise import Rows, check_derivative, room
 from gsisio_jax.inclusion.transforms import AffineForm, affine
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger, largest, smaller, smallest
 from gsisio_jax.interval.primitives import times
 from gsisio_jax.interval.reading import check_type
@@ -60,7 +61,7 @@ def decomposition_gain(derivative: Interval) -> Any:
 
 @partial(jax.jit, inline=True)  # one program instead of one for each operation
 def _gain(a: Any, b: Any) -> Any:
-    return jnp.where((a >= 0) | (b <= 0), 0, jnp.where(-a <= b, -a, b))
+    return where((a >= 0) | (b <= 0), 0, where(-a <= b, -a, b))
 
 
 @named_arguments
@@ -264,16 +265,16 @@ def tight(f: Callable[..., Any], derivative: Any = None, rounding: Rounding | No
 
 def _cases(a: Any, b: Any) -> Any:
     """The share t of y in z for the four cases: 0, so z = x, in the first two, where ``|a| <= b`` or ``a >= 0``."""
-    return jnp.where(-a <= b, 0, 1).astype(a.dtype)
+    return where(-a <= b, 0, 1).astype(a.dtype)
 
 
 def _optimal(a: Any, b: Any) -> Any:
     """The share ``-a / (b - a)``, cut off at 0 and 1, without overflow; it keeps an infinite a or b out of the sum."""
     small, large = jnp.minimum(-a, b), jnp.maximum(-a, b)
     mixed = (small > 0) & jnp.isfinite(large)
-    ratio = jnp.where(mixed, small, 0) / jnp.where(mixed, large, 1)
+    ratio = where(mixed, small, 0) / where(mixed, large, 1)
     part = ratio / (1 + ratio)
-    return jnp.where(-a <= b, part, 1 - part)
+    return where(-a <= b, part, 1 - part)
 
 
 def _centered(rows: Rows, a: Any, b: Any, t: Any) -> tuple[Any, Any]:

@@ -44,6 +44,7 @@ from gsisio_jax.inclusion.form_arithmetic import (
 )
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, computed_once, magnitude
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import add_up, fusion_barrier
 
@@ -231,8 +232,8 @@ def best_form(slope: Any, offset: Interval, natural: Interval, box: InputBox, sl
     size = jnp.abs(offset.lower) + jnp.abs(natural.lower) + size
     loss = _LOSS * jnp.finfo(width.dtype).eps * jax.lax.stop_gradient(size)
     good = jnp.isfinite(width) & (width - loss <= natural.upper - natural.lower)
-    slack = None if slack is None else jnp.where(good, slack, 0)
-    return Form(fusion_barrier(jnp.where(good, slope, 0)), computed_once(choose(good, offset, natural)), box, slack)
+    slack = None if slack is None else where(good, slack, 0)
+    return Form(fusion_barrier(where(good, slope, 0)), computed_once(choose(good, offset, natural)), box, slack)
 
 
 def unnormalised_node(

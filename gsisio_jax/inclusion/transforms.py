@@ -21,6 +21,7 @@ from gsisio_jax.inclusion.known_boxes import by_numpy, in_numpy
 from gsisio_jax.inclusion.node import POINT_MODE, Form, InputBox, Node, as_node, is_node, jac_of, slack_of, slope_of
 from gsisio_jax.interval.box import Interval, choose
 from gsisio_jax.interval.cast import as_array
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.primitives import add_up
 from gsisio_jax.interval.rounding import Rounding, down, rounded_by, sum_down, sum_up, up
 from gsisio_jax.traced import refuse_change, refuse_trace
@@ -166,7 +167,7 @@ def distance(box: Interval, point: Any) -> Interval:
     """Bounds of ``x - point`` over the box."""
     lower, upper = down(box.lower - point), up(box.upper - point)
     # A side on which the box ends at the point itself is exactly 0.
-    return Interval.unchecked(jnp.where(box.lower == point, 0, lower), jnp.where(box.upper == point, 0, upper))
+    return Interval.unchecked(where(box.lower == point, 0, lower), where(box.upper == point, 0, upper))
 
 
 def _typed(call: str, box: Any, args: tuple[Any, ...]) -> Interval:
@@ -280,7 +281,7 @@ def _in_type(node: Node, dtype: Any) -> Node:
 
         def raised(lost: Any, some: Any) -> Any:
             """In the narrower type, in which what is lost of a small slope would vanish."""
-            return lost.astype(dtype) + jnp.where(some, info.tiny, 0).astype(dtype)
+            return lost.astype(dtype) + where(some, info.tiny, 0).astype(dtype)
 
         lost = raised(2 * float(info.eps) * abs(slope), form.slope != 0)
         slack = sum_slack(lost, None if form.slack is None else raised(2 * form.slack, form.slack != 0))
@@ -307,7 +308,7 @@ def _finish_affine(node: Node, box: Interval) -> AffineForm:
     if is_known(slope):
         return AffineForm(jnp.asarray(np.moveaxis(slope, 0, -1)), jax.tree.map(jnp.asarray, offset), bounds)
     good = jnp.isfinite(add_up(jnp.abs(slope), 0))
-    return AffineForm(jnp.moveaxis(jnp.where(good, slope, 0), 0, -1), choose(good, offset, bounds), bounds)
+    return AffineForm(jnp.moveaxis(where(good, slope, 0), 0, -1), choose(good, offset, bounds), bounds)
 
 
 def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
@@ -323,7 +324,7 @@ def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
             slope = slope_of(node, InputBox.of(box))
             slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
             good, bounds = jnp.isfinite(add_up(abs(slope))), guard(node.range)
-            slope, slack = (jnp.where(good[..., None], v, 0) for v in (slope, slack))
+            slope, slack = (where(good[..., None], v, 0) for v in (slope, slack))
             return AffineForm(slope, choose(good, guard(node.offset), bounds), bounds), slack
 
         return _run(f, box, _variable, args, finish)

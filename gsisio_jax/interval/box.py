@@ -20,6 +20,7 @@ from jax.core import Tracer
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.cast import cast_down, cast_known, cast_up
+from gsisio_jax.interval.direct import absolute, minus, plus, where
 from gsisio_jax.interval.minmax import cut, larger, raised, smaller
 from gsisio_jax.interval.primitives import fusion_barrier
 from gsisio_jax.interval.reading import check_type, read_array
@@ -304,13 +305,13 @@ def widen(box: Interval, radius: Any) -> Interval:
 
 def magnitude(box: Interval) -> Any:
     """Largest magnitude in the box, elementwise."""
-    return jnp.maximum(abs(box.lower), abs(box.upper))
+    return jnp.maximum(absolute(box.lower), absolute(box.upper))
 
 
 def center_and_radius(box: Interval) -> tuple[Any, Any]:
     """Center and radius of a traced box, to nearest; an infinite side makes the radius infinite and the center 0."""
-    radius = 0.5 * (box.upper - box.lower)
-    return jnp.where(radius < jnp.inf, 0.5 * (box.lower + box.upper), 0), radius
+    radius = 0.5 * minus(box.upper, box.lower)
+    return where(radius < jnp.inf, 0.5 * plus(box.lower, box.upper), 0), radius
 
 
 def entire_like(box: Any) -> Interval:
@@ -321,7 +322,7 @@ def entire_like(box: Any) -> Interval:
 
 def choose(mask: Any, a: Interval, b: Interval) -> Interval:
     """Elementwise `a` where the mask holds, else `b`."""
-    return Interval.unchecked(jnp.where(mask, a.lower, b.lower), jnp.where(mask, a.upper, b.upper))
+    return Interval.unchecked(where(mask, a.lower, b.lower), where(mask, a.upper, b.upper))
 
 
 def _check_pair(call: str, a: Any, b: Any) -> None:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, is_concrete, nan_to_unbounded
+from gsisio_jax.interval.direct import absolute, minus, multiple_and_more, plus, where
 from gsisio_jax.interval.primitives import add_up, scale
 from gsisio_jax.interval.reading import read_array
 
@@ -78,8 +79,9 @@ def widened_for_sums(box: Interval, terms: int) -> Interval:
     info = jnp.finfo(box.dtype)
     kind = np.dtype(box.dtype).type
     kappa, floor = kind((terms + 8) * float(info.eps)), kind(rounding.FLUSHED * float(info.tiny))
-    lower, upper = (jax.lax.stop_gradient(abs(side)) * kappa + floor for side in (box.lower, box.upper))
-    return Interval.unchecked(box.lower - lower, box.upper + upper)
+    sides = (jax.lax.stop_gradient(absolute(side)) for side in (box.lower, box.upper))
+    lower, upper = (multiple_and_more(side, kappa, floor) for side in sides)
+    return Interval.unchecked(minus(box.lower, lower), plus(box.upper, upper))
 
 
 def plain_image(matrix: Any, x: Interval) -> Interval:
@@ -100,10 +102,10 @@ def faint(weights: Any) -> Any:
     widened before them: that was multiplied by the weight, too. 0 for all other rows."""
     if not rounding.outward():
         return 0.0
-    small = ((weights != 0) & (abs(weights) < 2.0**-40)).any(-1)
+    small = ((weights != 0) & (absolute(weights) < 2.0**-40)).any(-1)
     dtype = jnp.result_type(weights)
     lost = jnp.finfo(dtype).dtype.type(2.0**10 * float(jnp.finfo(dtype).tiny))
-    return np.where(small, lost, dtype.type(0)) if isinstance(weights, np.ndarray) else jnp.where(small, lost, 0)
+    return np.where(small, lost, dtype.type(0)) if isinstance(weights, np.ndarray) else where(small, lost, 0)
 
 
 def products(matrix: Any, x: Interval) -> tuple[Any, Any]:
@@ -112,7 +114,7 @@ def products(matrix: Any, x: Interval) -> tuple[Any, Any]:
     # Sides are chosen by sign, not by min and max: those tie on boxes of width 0 and would halve the derivative of the
     # width.
     up = matrix >= 0
-    return jnp.where(up, at_lower, at_upper), jnp.where(up, at_upper, at_lower)
+    return where(up, at_lower, at_upper), where(up, at_upper, at_lower)
 
 
 def matvec_upper(matrix: Any, magnitude: Any) -> Any:
@@ -124,4 +126,4 @@ def loose_matvec_upper(matrix: Any, magnitude: Any) -> Any:
     """`matvec_upper` for matrices of the size of rounding, with less work and a thousandth more (`rounding.generous`);
     exactly 0 for rows of zeros."""
     found = rounding.generous(add_up(scale(matrix, magnitude[..., None, :])))
-    return jnp.where((matrix != 0).any(-1), found, 0)
+    return where((matrix != 0).any(-1), found, 0)

@@ -7,6 +7,7 @@ which `gsisio_jax.scalar` can simplify it. Each is an ordinary expression of `ja
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any
 
 import jax
@@ -14,6 +15,8 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import ad, batching, mlir
+
+from gsisio_jax.interval.direct import alike, common, plus
 
 
 def elementwise(name: str, body: Callable[..., Any], derivative: Callable[..., Any]) -> Callable[..., Any]:
@@ -36,7 +39,7 @@ def elementwise(name: str, body: Callable[..., Any], derivative: Callable[..., A
         size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
 
         def spread(x: Any, d: Any) -> Any:
-            return jnp.broadcast_to(x, (size, *np.shape(x))) if d is None else jnp.moveaxis(x, d, 0)
+            return alike(x, (size, *np.shape(x)), x.dtype) if d is None else x if d == 0 else jnp.moveaxis(x, d, 0)
 
         return primitive.bind(*map(spread, args, dims)), 0
 
@@ -49,18 +52,11 @@ def elementwise(name: str, body: Callable[..., Any], derivative: Callable[..., A
     ad.primitive_jvps[primitive] = jvp
 
     def call(*args: Any) -> Any:
-        dtype = jnp.result_type(*args)
-        shape = np.broadcast_shapes(*map(np.shape, args))
-        return primitive.bind(*(_alike(arg, shape, dtype) for arg in args))
+        shape, dtype = common(args)
+        return primitive.bind(*(alike(arg, shape, dtype) for arg in args))
 
     call.primitive = primitive  # type: ignore[attr-defined]
     return call
-
-
-def _alike(value: Any, shape: tuple[int, ...], dtype: Any) -> Any:
-    if isinstance(value, jax.Array) and value.dtype == dtype and value.shape == shape:
-        return value
-    return jnp.broadcast_to(jnp.asarray(value, dtype), shape)
 
 
 def _product_rule(partials: Callable[..., tuple[Any, Any]]) -> Callable[..., Any]:
@@ -137,7 +133,7 @@ def add_up(values: Any, axis: int = -1) -> Any:
     if isinstance(values, np.ndarray) or not 0 < count <= _SHORT:
         return values.sum(axis)
     entries = [jax.lax.index_in_dim(values, i, axis, keepdims=False) for i in range(count)]
-    return sum(entries[1:], entries[0])
+    return reduce(plus, entries)
 
 
 def multiplied(a: Any, b: Any) -> Any:
@@ -146,7 +142,7 @@ def multiplied(a: Any, b: Any) -> Any:
     if not 0 < count <= _SHORT:
         return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
     terms = [a[..., :, i, None] * b[..., None, i, :] for i in range(count)]
-    return sum(terms[1:], terms[0])
+    return reduce(plus, terms)
 
 
 def matmul(a: Any, b: Any) -> Any:

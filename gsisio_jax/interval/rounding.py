@@ -42,6 +42,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from gsisio_jax.interval.direct import absolute, minus, multiple_and_more, plus, where
 from gsisio_jax.interval.primitives import add_up, fusion_barrier
 
 Rounding = Literal["outward", "nearest"]
@@ -128,7 +129,8 @@ def error(size: Any, ulps: Any = 2.0, floor: float = _FLOOR) -> Any:
     info = jnp.finfo(size.dtype)
     kind = np.dtype(size.dtype).type
     share = kind(ulps * float(info.eps)) if isinstance(ulps, float | int) else ulps * kind(info.eps)
-    wide = size * share + kind(floor * float(info.tiny))
+    least = kind(floor * float(info.tiny))
+    wide = multiple_and_more(size, share, least)
     return wide if isinstance(size, np.ndarray | np.generic) else jax.lax.stop_gradient(wide)
 
 
@@ -136,24 +138,24 @@ def down(x: Any, ulps: Any = 2.0, floor: float = _FLOOR) -> Any:
     """A number at or below every number that x may stand for, if x is off by ``(ulps - 1) eps |x| + tiny`` at most."""
     if not outward() or not jnp.issubdtype(x.dtype, jnp.floating):
         return x
-    return x - error(abs(x), ulps, floor)
+    return minus(x, error(absolute(x), ulps, floor))
 
 
 def up(x: Any, ulps: Any = 2.0, floor: float = _FLOOR) -> Any:
     """A number at or above every number that x may stand for; see `down`."""
     if not outward() or not jnp.issubdtype(x.dtype, jnp.floating):
         return x
-    return x + error(abs(x), ulps, floor)
+    return plus(x, error(absolute(x), ulps, floor))
 
 
 def lowered(x: Any, size: Any, ulps: Any, floor: float = _FLOOR) -> Any:
     """`down` for an x whose error goes with `size`, the sum of what entered it, instead of with ``|x|``."""
-    return x - error(size, ulps, floor) if outward() else x
+    return minus(x, error(size, ulps, floor)) if outward() else x
 
 
 def raised(x: Any, size: Any, ulps: Any, floor: float = _FLOOR) -> Any:
     """`up` with `size`; see `lowered`."""
-    return x + error(size, ulps, floor) if outward() else x
+    return plus(x, error(size, ulps, floor)) if outward() else x
 
 
 def generous(radius: Any) -> Any:
@@ -166,7 +168,8 @@ def generous(radius: Any) -> Any:
     thousandth is nothing.
     """
     kind = np.dtype(radius.dtype).type
-    return fusion_barrier(radius * kind(1 + 2.0**-10) + kind(FLUSHED * float(jnp.finfo(radius.dtype).tiny)))
+    least = kind(FLUSHED * float(jnp.finfo(radius.dtype).tiny))
+    return fusion_barrier(multiple_and_more(radius, kind(1 + 2.0**-10), least))
 
 
 def sum_down(terms: Any, axis: int = -1) -> Any:
@@ -175,7 +178,7 @@ def sum_down(terms: Any, axis: int = -1) -> Any:
     if not outward() or not terms.shape[axis]:
         return fusion_barrier(total)
     n = terms.shape[axis] + 4.0
-    return fusion_barrier(total - error(add_up(abs(terms), axis), n, n))
+    return fusion_barrier(minus(total, error(add_up(absolute(terms), axis), n, n)))
 
 
 def sum_up(terms: Any, axis: int = -1) -> Any:
@@ -184,15 +187,15 @@ def sum_up(terms: Any, axis: int = -1) -> Any:
     if not outward() or not terms.shape[axis]:
         return fusion_barrier(total)
     n = terms.shape[axis] + 4.0
-    return fusion_barrier(total + error(add_up(abs(terms), axis), n, n))
+    return fusion_barrier(plus(total, error(add_up(absolute(terms), axis), n, n)))
 
 
 def unbounded(x: Any, side: float) -> Any:
     """``side`` (-inf for lower bounds, inf for upper ones) where x is NaN or infinite on the wrong side."""
-    good = x < jnp.inf if side < 0 else x > -jnp.inf
+    end = np.dtype(x.dtype).type(side)
     if isinstance(x, np.ndarray | np.generic):
-        return np.where(good, x, x.dtype.type(side))
-    return jnp.where(good, x, side)
+        return np.where(x < -end if side < 0 else x > -end, x, end)
+    return where((jax.lax.lt if side < 0 else jax.lax.gt)(x, -end), x, end)
 
 
 # Numbers that are known while tracing ---------------------------------------------------------------------------------

@@ -20,6 +20,7 @@ import numpy as np
 
 from gsisio_jax.inclusion.atoms import States
 from gsisio_jax.interval.box import Interval, choose
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import cut, larger, largest, raised, smaller, smallest
 from gsisio_jax.observer.contractors import Affine, affine_rows, contract_affine_rows, solve_remainder
 from gsisio_jax.observer.domain import Domain
@@ -74,7 +75,7 @@ def contract(
         left, some = hull(cells, ~(least < -domain.tolerance))
         # Where all contradict something, the box stays what it is; what the best of them misses is noted.
         best = jnp.argmax(least)
-        return choose(some, left, box), tuple(jnp.where(some, jnp.inf, part[best]) for part in (slack, room))
+        return choose(some, left, box), tuple(where(some, jnp.inf, part[best]) for part in (slack, room))
 
     box, (slack, room) = jax.lax.scan(turn, domain.box, None, length=ROUNDS)
     return domain.record_margin(slack[-1], Source.OUTPUT).record_margin(room[-1], Source.STATE).with_box(box)
@@ -109,11 +110,11 @@ def _cut(lower: Any, upper: Any, count: int) -> tuple[Any, Any]:
     share = (np.arange(1, count) / count).astype(lower.dtype)
     inner = jnp.clip(lower + (upper - lower) * share, lower, upper)
     edges, finite = jnp.concatenate([lower[None], inner, upper[None]]), jnp.isfinite(upper - lower)
-    return jnp.where(finite, edges[:-1], lower), jnp.where(finite, edges[1:], upper)
+    return where(finite, edges[:-1], lower), where(finite, edges[1:], upper)
 
 
 def hull(boxes: Interval, alive: Any) -> tuple[Interval, Any]:
     """Hull of the boxes (cells, r) that are alive, and whether there are any."""
-    low = smallest(jnp.where(alive[:, None], boxes.lower, jnp.inf), 0)
-    high = largest(jnp.where(alive[:, None], boxes.upper, -jnp.inf), 0)
+    low = smallest(where(alive[:, None], boxes.lower, jnp.inf), 0)
+    high = largest(where(alive[:, None], boxes.upper, -jnp.inf), 0)
     return Interval.unchecked(low, high), alive.any()

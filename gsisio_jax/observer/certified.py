@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from gsisio_jax.inclusion.atoms import States, wider
 from gsisio_jax.interval.box import Interval, center_and_radius, choose, intersect
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.image import plain_image
 from gsisio_jax.interval.minmax import cut, raised
 from gsisio_jax.interval.primitives import matmul, scale
@@ -52,14 +53,14 @@ def certified(
     applies = inside(before, region) & inside(domain.box, region) & carry.believed & ~carry.starts
     applies = applies & in_box(carry.u, observer.u_region) & in_box(u, observer.u_region)
     # Outside, stand on a finite point of the region instead: a masked NaN would still poison gradients.
-    c = jnp.where(applies, past.center, jnp.asarray(region.center, right.dtype))
-    radius = jnp.where(applies, past.radius, 0)
+    c = where(applies, past.center, jnp.asarray(region.center, right.dtype))
+    radius = where(applies, past.radius, 0)
     promised = Promised(applies, c, wider(abs(c), maps.terms), radius, (carry.h.value, carry.h.value_error))
     gains, constants = observer.gains, observer.rounding_constants
     around = _around(maps, gains.residual[0], _reach(constants, before, promised), promised, known.right[0])
     around = plainly_wider(around, _first(left))
     joint, slack = intersect(right[0], around)
-    domain = domain.record_margin(jnp.where(applies, slack, jnp.inf), Source.STATE)
+    domain = domain.record_margin(where(applies, slack, jnp.inf), Source.STATE)
     joint = choose(applies, joint, Interval.unchecked(c, c))
     safe = choose(applies, domain.box, Interval.unchecked(c, c))
 
@@ -86,7 +87,7 @@ def _bounded(region: Interval, bounds: Interval, dtype: Any) -> Interval:
     """The part of the region within the state bounds; 0 for a state without bounds, on which psi does not depend."""
     lower, upper = raised(region.lower, bounds.lower), cut(region.upper, bounds.upper)
     known = jnp.isfinite(lower) & jnp.isfinite(upper)
-    return Interval.unchecked(*(jnp.where(known, side, 0).astype(dtype) for side in (lower, upper)))
+    return Interval.unchecked(*(where(known, side, 0).astype(dtype) for side in (lower, upper)))
 
 
 def _recentred(
@@ -145,7 +146,7 @@ def _reach(constants: RoundingConstants, before: Interval, promised: Promised) -
     if constants.slices is None:
         reach = matmul(jnp.asarray(constants.growth, promised.radius.dtype), promised.radius)
         return reach, reach
-    lower, upper = (jnp.where(promised.applies, side, promised.center) for side in (before.lower, before.upper))
+    lower, upper = (where(promised.applies, side, promised.center) for side in (before.lower, before.upper))
     return constants.slices.reach(lower, promised.center, upper)
 
 

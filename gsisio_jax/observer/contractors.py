@@ -16,6 +16,7 @@ import numpy as np
 from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, wider
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, center_and_radius
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import matmul, scale
 
@@ -60,15 +61,15 @@ def contract_affine_rows(states: States, form: Affine, z: Interval) -> tuple[Int
     slack = smaller(high - (all_middle - all_spread), (all_middle + all_spread) - low)
     # Sums over the other states one by one: the total minus its own term would be inf - inf.
     others = ~np.eye(n, dtype=bool)
-    rest = jnp.where(others, middle[:, None, :], 0).sum(-1)
-    loose = jnp.where(others, spread[:, None, :], 0).sum(-1) + form.radius[:, None]
+    rest = where(others, middle[:, None, :], 0).sum(-1)
+    loose = where(others, spread[:, None, :], 0).sum(-1) + form.radius[:, None]
     own_low, own_high = low[:, None] - rest - loose, high[:, None] - rest + loose
     largest = size.max(-1, keepdims=True, initial=0.0)
     usable = size > _SMALLEST_SLOPE * largest
-    inverse = 1 / jnp.where(usable, slope, 1)
+    inverse = 1 / where(usable, slope, 1)
     up = slope > 0
-    a, b = jnp.where(up, own_low, own_high) * inverse, jnp.where(up, own_high, own_low) * inverse
-    return Interval.unchecked(jnp.where(usable, a, -jnp.inf), jnp.where(usable, b, jnp.inf)), slack
+    a, b = where(up, own_low, own_high) * inverse, where(up, own_high, own_low) * inverse
+    return Interval.unchecked(where(usable, a, -jnp.inf), where(usable, b, jnp.inf)), slack
 
 
 class Newton(NamedTuple):
@@ -82,11 +83,11 @@ class Newton(NamedTuple):
 
     def begin(self, right: Any) -> Any:
         """x for another right side (n,)."""
-        return jnp.where(self.usable, self.point + matmul(self.inverse, right - self.right), right)
+        return where(self.usable, self.point + matmul(self.inverse, right - self.right), right)
 
     def improved(self, x: Any, missing: Any) -> Any:
         """x moved by what it misses of the right side (n,)."""
-        return x + jnp.where(self.usable, matmul(self.inverse, missing), missing)
+        return x + where(self.usable, matmul(self.inverse, missing), missing)
 
 
 def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, terms: int) -> tuple[Interval, Newton]:
@@ -133,7 +134,7 @@ def solve_remainder(N_z: Any, right: Interval, psi: Affine, states: States, term
             spread = spread + scale(size, matmul(left, reached[:, None])[:, None, :, 0]).sum(-1) * (1 + 2.0**-10)
         spread = spread + wider(states.magnitude + scale(size, bent[:, None, :]).sum(-1), terms + 2 * n + 2 * q)
     keep = verified[:, None]
-    box = Interval.unchecked(jnp.where(keep, middle - spread, -jnp.inf), jnp.where(keep, middle + spread, jnp.inf))
+    box = Interval.unchecked(where(keep, middle - spread, -jnp.inf), where(keep, middle + spread, jnp.inf))
     return box, Newton(middle[0], center[0], M[0], verified[0])
 
 
@@ -151,12 +152,12 @@ def _verified_inverse(matrix: Any) -> tuple[Any, Any, Any]:
     q = matrix.shape[-1]
     if q == 1:
         usable = abs(matrix) > _SMALLEST_PIVOT
-        return 1 / jnp.where(usable, matrix, 1), jnp.zeros_like(matrix), usable[..., 0, 0]
+        return 1 / where(usable, matrix, 1), jnp.zeros_like(matrix), usable[..., 0, 0]
     identity = jnp.broadcast_to(jnp.eye(q, dtype=matrix.dtype), matrix.shape)
     work = jnp.concatenate([matrix, identity], axis=-1)
     for i in range(q):
         pivot = work[..., i : i + 1, i : i + 1]
-        row = work[..., i : i + 1, :] / jnp.where(jnp.abs(pivot) > _SMALLEST_PIVOT, pivot, 1)
+        row = work[..., i : i + 1, :] / where(jnp.abs(pivot) > _SMALLEST_PIVOT, pivot, 1)
         work = work - work[..., :, i : i + 1] * row
         work = jnp.concatenate([work[..., :i, :], row, work[..., i + 1 :, :]], axis=-2)
     inverse = work[..., q:]

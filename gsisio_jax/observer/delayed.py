@@ -19,6 +19,7 @@ import numpy as np
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, entire_like
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.image import image
 from gsisio_jax.observer import step as current_step
 from gsisio_jax.observer.certificate import Certificate
@@ -81,7 +82,7 @@ class DelayedObserver(Wrapped):
         """
         rows = self.lift.rows(y.dtype)
         flat, seen = y.ravel(), jnp.isfinite(y.ravel())
-        value = image(rows.outputs, point(jnp.where(seen, flat, 0)))
+        value = image(rows.outputs, point(where(seen, flat, 0)))
         if rows.known.any():
             value = add(value, image(-rows.known, point(u.ravel())))
         middle = value.center
@@ -93,7 +94,7 @@ class DelayedObserver(Wrapped):
             jnp.concatenate([now[0], later])
             for now, later in ((noise.v.lower, more.lower), (noise.v.upper, more.upper))
         ))  # fmt: skip
-        return jnp.concatenate([y[0], jnp.where(missing, jnp.nan, middle)]), Noise.unchecked(noise.w[0], joined)
+        return jnp.concatenate([y[0], where(missing, jnp.nan, middle)]), Noise.unchecked(noise.w[0], joined)
 
 
 class Waiting(eqx.Module):
@@ -132,8 +133,8 @@ def advance(
     measured, bounds = observer.row(kept.y, kept.u, kept.noise)
     after, out = current_step.advance(observer.inner, before, measured, kept.u[0], bounds, hold)
     due = kept.filled[0]
-    after = jax.tree.map(lambda a, b: jnp.where(due, a, b), after, before)
-    out = jax.tree.map(lambda a, b: jnp.where(due, a, b), out, _nothing(out))
+    after = jax.tree.map(lambda a, b: where(due, a, b), after, before)
+    out = jax.tree.map(lambda a, b: where(due, a, b), out, _nothing(out))
     left = jax.tree.map(lambda rows: rows[1:], kept)
     return replace(after, older=replace(left, older=after.older)), out
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import cut, raised, smaller
 from gsisio_jax.observer.status import SOURCE_STRIDE, Source
 
@@ -52,7 +53,7 @@ class Domain(eqx.Module):
         best, code, gap = cut(jnp.asarray(jnp.inf, self.box.dtype), slack[0]), jnp.int32(first), cut(self.gap, slack[0])
         for i in range(1, slack.shape[0]):
             # No argmin and no gather: both are slow in batches.
-            code = jnp.where(slack[i] < best, jnp.int32(first + i), code)
+            code = where(slack[i] < best, jnp.int32(first + i), code)
             best, gap = cut(best, slack[i]), cut(gap, slack[i])
         return self._noted(best, code, gap)
 
@@ -64,7 +65,7 @@ class Domain(eqx.Module):
         if self.margin is None:
             return Domain(self.box, self.tolerance, gap, margin, source)
         new = (margin < self.margin) & ~(self.margin < -self.tolerance)
-        margin, source = jnp.where(new, margin, self.margin), jnp.where(new, source, self.source)
+        margin, source = where(new, margin, self.margin), where(new, source, self.source)
         return Domain(self.box, self.tolerance, gap, margin, source)
 
     def intersect(self, others: Interval | None, kind: Source, quiet: Interval | None = None) -> Domain:
@@ -92,9 +93,9 @@ class Domain(eqx.Module):
             return self
         width = upper - lower
         empty = width < 0
-        met = Interval.unchecked(jnp.where(empty, box.lower, lower), jnp.where(empty, box.upper, upper))
+        met = Interval.unchecked(where(empty, box.lower, lower), where(empty, box.upper, upper))
         # Boxes may also miss each other where each of them meets this one.
-        noted = self.record_margin(cut(room, jnp.where(empty, width, jnp.inf)), kind)
+        noted = self.record_margin(cut(room, where(empty, width, jnp.inf)), kind)
         gap = self.gap
         for i in range(width.shape[0]):
             gap = cut(gap, width[i])
@@ -109,8 +110,8 @@ class Domain(eqx.Module):
         """Margin and source; a gap within the tolerance counts as 0."""
         if self.margin is None:
             return jnp.asarray(jnp.inf, self.box.dtype), jnp.int32(0)
-        margin = jnp.where((self.margin < 0) & (self.margin >= -self.tolerance), 0, self.margin)
-        return margin, jnp.where(jnp.isinf(margin), 0, self.source)
+        margin = where((self.margin < 0) & (self.margin >= -self.tolerance), 0, self.margin)
+        return margin, where(jnp.isinf(margin), 0, self.source)
 
 
 def _meeting(boxes: Interval) -> tuple[Any, Any]:
@@ -123,5 +124,5 @@ def _meeting(boxes: Interval) -> tuple[Any, Any]:
 
 def largest_magnitude(*values: Any) -> Any:
     """The largest finite absolute value of some arrays."""
-    finite = [jnp.where(jnp.isfinite(value), jnp.abs(value), 0) for value in values]
+    finite = [where(jnp.isfinite(value), jnp.abs(value), 0) for value in values]
     return jax.lax.stop_gradient(jnp.concatenate([value.ravel() for value in finite]).max(initial=0.0))

@@ -11,6 +11,7 @@ from gsisio_jax.inclusion.atoms import wider
 from gsisio_jax.inclusion.transforms import affine_with_slack
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, magnitude
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.image import image, loose_matvec_upper, matvec_upper, plain_image, widened_for_sums
 from gsisio_jax.observer.contractors import Affine, centred_form
 from gsisio_jax.observer.domain import Domain
@@ -40,7 +41,7 @@ class FirstForm(NamedTuple):
             known, slack = function(observer.system.state_bounds, u)
         center, radius = known.offset.center, known.offset.radius
         if rounding.outward():
-            radius = radius + wider(abs(center) + jnp.where(jnp.isfinite(radius), radius, 0), 0)
+            radius = radius + wider(abs(center) + where(jnp.isfinite(radius), radius, 0), 0)
         return cls(known.slope, center, radius, slack)
 
     def on(self, box: Interval) -> Affine:

@@ -17,6 +17,7 @@ import numpy as np
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, choose, is_concrete, nan_to_unbounded
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
 from gsisio_jax.observer.contractors import affine_rows, contract_affine_rows
 from gsisio_jax.observer.domain import Domain
@@ -53,7 +54,7 @@ class Unwrapped(NamedTuple):
 
     def unless(self, mask: Any, other: Unwrapped) -> Unwrapped:
         """The other one where the mask holds."""
-        return jax.tree.map(lambda mine, its: jnp.where(mask, its, mine), self, other)
+        return jax.tree.map(lambda mine, its: where(mask, its, mine), self, other)
 
 
 def unwrap(system: System, ranges: Interval, y: Any, u: Any, noise: Noise) -> Unwrapped:
@@ -70,30 +71,30 @@ def unwrap(system: System, ranges: Interval, y: Any, u: Any, noise: Noise) -> Un
     """
     rows, period = [j for j, _ in system.periodic], _periods(system, y.dtype)
     missing, target = ~jnp.isfinite(_at(y, rows)), _target(system, ranges, u, noise)
-    seen = jnp.where(missing, 0, _at(y, rows))
+    seen = where(missing, 0, _at(y, rows))
     first, last, near, usable = _multiples(seen, target, period)
     usable = usable & ~missing
     # Where none fits, the nearest one: what it contradicts, and by how much, is what a reader wants to know.
     none = usable & (last < first)
-    first, last = (jnp.where(usable, jnp.where(none, near, k), 0) for k in (first, last))
+    first, last = (where(usable, where(none, near, k), 0) for k in (first, last))
     middle, half = 0.5 * (first + last) * period, 0.5 * (last - first) * period
     turned, still = seen + middle, (first == 0) & (last == 0)
     radius = half
     if rounding.outward():  # the period, products and sums: less than five ulps of what enters
         radius = half + rounding.error(abs(seen) + abs(middle) + half, 8.0)
-    radius = jnp.where(still, 0, radius)
+    radius = where(still, 0, radius)
     v = noise.v
     wider = add(Interval.unchecked(_at(v.lower, rows), _at(v.upper, rows)), Interval.unchecked(-radius, radius))
     sides = (
-        _with(side, rows, jnp.where(still, _at(side, rows), its))
+        _with(side, rows, where(still, _at(side, rows), its))
         for side, its in ((v.lower, wider.lower), (v.upper, wider.upper))
     )
     slack = jnp.minimum(target.upper - turned, turned - target.lower)
     return Unwrapped(
-        _with(y, rows, jnp.where(usable, turned, jnp.nan)),
+        _with(y, rows, where(usable, turned, jnp.nan)),
         Noise.unchecked(noise.w, Interval.unchecked(*sides)),
         ~missing & (~usable | (first < last)),
-        _with(jnp.full_like(y, jnp.inf), rows, jnp.where(none, slack, jnp.inf)),
+        _with(jnp.full_like(y, jnp.inf), rows, where(none, slack, jnp.inf)),
     )
 
 
@@ -114,7 +115,7 @@ def _multiples(seen: Any, target: Interval, period: np.ndarray) -> tuple[Any, An
     and whether they are known and not too large; constants for gradients."""
     seen, low, high = jax.lax.stop_gradient((seen, target.lower, target.upper))
     finite = jnp.isfinite(low) & jnp.isfinite(high)
-    low, high = jnp.where(finite, low, 0), jnp.where(finite, high, 0)
+    low, high = where(finite, low, 0), where(finite, high, 0)
     eps = float(jnp.finfo(seen.dtype).eps)
     edge = (abs(seen) + abs(low) + abs(high)) * np.dtype(seen.dtype).type(_EDGE * eps)
     first, last = rounding.down((low - edge - seen) / period, 6.0), rounding.up((high + edge - seen) / period, 6.0)
@@ -168,7 +169,7 @@ def contract(
     if system.periodic_states:
         unused = conflict & (jnp.asarray(hold) | fallback.conflict)
         box = choose(conflict, fallback.box, domain.box)
-        box, chosen = settled(maps, box, chosen, jnp.where(unused, lost, y), u, noise)
+        box, chosen = settled(maps, box, chosen, where(unused, lost, y), u, noise)
         domain, fallback = domain.with_box(box), fallback.with_box(box)
     return domain, fallback, d, chosen
 
@@ -204,12 +205,12 @@ def settled(maps: Maps, box: Interval, chosen: Unwrapped, y: Any, u: Any, noise:
     slip = rounding.error(abs(center) + half, 6.0) if rounding.outward() else 0.0
     around = Interval.unchecked(center - half - slip, center + half + slip)
     moved = choose(free, around, box)
-    count = jnp.where(free | far, -jnp.round(moved.center / period), 0)
+    count = where(free | far, -jnp.round(moved.center / period), 0)
     moved = moved_by(moved, count, period)
     turned = unwrap(system, ranges_on(maps, moved, u), y, u, noise)
     found = _measured(maps, moved, turned, u)
     # Where a range of several periods has other reasons, what was known of the state may be better.
-    gain = (jnp.where(free, box.width - found.width, 0) / period).sum()
+    gain = (where(free, box.width - found.width, 0) / period).sum()
     better = far.any() | (gain > 0)
     return choose(better, found, box), chosen.unless(better, turned)
 
@@ -226,9 +227,7 @@ def _around(maps: Maps, box: Interval, free: Any, tied: np.ndarray, y: Any, u: A
         for r, (_, of_output) in enumerate(system.periodic):
             if abs(tied[i, r]) == 1:
                 usable = jnp.isfinite(off[r]) & ~done
-                guess = guess + jnp.where(
-                    usable, jnp.where(usable, off[r], 0) * float(tied[i, r] * period / of_output), 0
-                )
+                guess = guess + where(usable, where(usable, off[r], 0) * float(tied[i, r] * period / of_output), 0)
                 done = done | usable
         entries[i] = guess
     return jnp.stack(entries)
@@ -247,7 +246,7 @@ def _measured(maps: Maps, box: Interval, seen: Unwrapped, u: Any) -> Interval:
 def noted(out: StepOutput, y: Any, seen: Unwrapped) -> StepOutput:
     """The status of a step for the y[k] that was logged: MISSING means what is missing there."""
     here = jnp.isfinite(y).all() & ~jnp.isfinite(seen.y).all()
-    status = out.status - jnp.where(here, int(Status.MISSING), 0) + jnp.where(seen.open.any(), int(Status.AMBIGUOUS), 0)
+    status = out.status - where(here, int(Status.MISSING), 0) + where(seen.open.any(), int(Status.AMBIGUOUS), 0)
     return StepOutput(out.state, out.input, out.current_input, status.astype(jnp.int32), out.margin, out.source)
 
 

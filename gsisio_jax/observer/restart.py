@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.interval.box import Interval, choose, is_concrete
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.image import plain_image, widened_for_sums
 from gsisio_jax.observer.contractors import contract_affine_rows
 from gsisio_jax.observer.domain import Domain
@@ -70,27 +71,27 @@ def agreeing(maps: Maps, alone: Domain, y: Any, u: Any, noise: Noise) -> tuple[D
     disagree = alone.conflict
     if redundant:
         disagree = disagree | ~of(np.ones(system.l, bool))[0]
-    size = [jnp.where(ok, (seen & kept).sum(), -1) for ok, kept in zip(agree, sets, strict=True)]
+    size = [where(ok, (seen & kept).sum(), -1) for ok, kept in zip(agree, sets, strict=True)]
     largest = jnp.stack(size).max()
     chosen = [(count == largest) & (largest >= 0) for count in size]
-    lower = jnp.stack([jnp.where(yes, box.lower, jnp.inf) for yes, box in zip(chosen, boxes, strict=True)]).min(0)
-    upper = jnp.stack([jnp.where(yes, box.upper, -jnp.inf) for yes, box in zip(chosen, boxes, strict=True)]).max(0)
+    lower = jnp.stack([where(yes, box.lower, jnp.inf) for yes, box in zip(chosen, boxes, strict=True)]).min(0)
+    upper = jnp.stack([where(yes, box.upper, -jnp.inf) for yes, box in zip(chosen, boxes, strict=True)]).max(0)
     used = disagree & (largest >= 0)
     believed = jnp.stack([kept | ~yes for yes, kept in zip(chosen, sets, strict=True)]).all(0)
     box = choose(used, Interval.unchecked(lower, upper), alone.box)
-    gap = jnp.where(used, 0, jnp.where(disagree, -jnp.inf, alone.gap))
-    return Domain(box, tolerance, gap, alone.margin, alone.source), jnp.where(used & ~believed, jnp.nan, y)
+    gap = where(used, 0, where(disagree, -jnp.inf, alone.gap))
+    return Domain(box, tolerance, gap, alone.margin, alone.source), where(used & ~believed, jnp.nan, y)
 
 
 def _met(box: Interval, boxes: Interval, slack: Any, rows: list[int]) -> tuple[Interval, Any]:
     """A box met with those of some rows, never crossed, and the least slack; what overflowed says nothing."""
     lower, upper, gap = box.lower, box.upper, jnp.asarray(jnp.inf, box.dtype)
     for r in rows:
-        lower = jnp.where(boxes.lower[r] > lower, boxes.lower[r], lower)
-        upper = jnp.where(boxes.upper[r] < upper, boxes.upper[r], upper)
-        gap = jnp.where(slack[r] < gap, slack[r], gap)
+        lower = where(boxes.lower[r] > lower, boxes.lower[r], lower)
+        upper = where(boxes.upper[r] < upper, boxes.upper[r], upper)
+        gap = where(slack[r] < gap, slack[r], gap)
     for i in range(lower.shape[0]):
-        gap = jnp.where(upper[i] - lower[i] < gap, upper[i] - lower[i], gap)
+        gap = where(upper[i] - lower[i] < gap, upper[i] - lower[i], gap)
     return Interval.unchecked(jnp.minimum(lower, upper), jnp.maximum(lower, upper)), gap
 
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from gsisio_jax.inclusion.atoms import AtomBounds, States
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, nan_to_unbounded
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
 from gsisio_jax.observer import cells, input_memory, past_cells, periodic, recovery, restart, window
 from gsisio_jax.observer.bank import Known, LinearBounds, Terms
@@ -69,10 +70,10 @@ def advance(observer: Observer, carry: Carry, y: Any, u: Any, noise: Noise, hold
     domain, fallback, d = _contract(maps, carry, y, u, noise)
     if hold:
         fallback, kept = _held(maps, carry, y, u, noise)
-        y = jnp.where(domain.conflict, kept, y)
+        y = where(domain.conflict, kept, y)
     elif restart.can_disagree(observer):
         fallback, kept = restart.agreeing(maps, fallback, y, u, noise)
-        y = jnp.where(domain.conflict, kept, y)
+        y = where(domain.conflict, kept, y)
     return _finish(maps, domain, fallback, carry, d, y, u, noise, hold)
 
 
@@ -87,10 +88,10 @@ def _held(maps: Maps, carry: Carry, y: Any, u: Any, noise: Noise) -> tuple[Domai
     rows = [
         [agrees[i] for i, outputs in enumerate(maps.observer.output_rows) if j in outputs] for j in range(y.shape[0])
     ]
-    kept = jnp.stack([jnp.where(jnp.stack(row).all(), y[j], jnp.nan) if row else y[j] for j, row in enumerate(rows)])
+    kept = jnp.stack([where(jnp.stack(row).all(), y[j], jnp.nan) if row else y[j] for j, row in enumerate(rows)])
     domain, _, _ = _contract(maps, carry, kept, u, noise)
     box = choose(domain.conflict, past.box, domain.box)
-    return past.with_box(box), jnp.where(domain.conflict, nothing, kept)
+    return past.with_box(box), where(domain.conflict, nothing, kept)
 
 
 @_stage("known")
@@ -269,7 +270,7 @@ def _limited(box: Interval) -> Interval:
     """Numbers so large that the next step would overflow count as infinite."""
     most = float(jnp.finfo(box.dtype).max) ** (2 / 3)
     return Interval.unchecked(
-        jnp.where(box.lower > -most, box.lower, -jnp.inf), jnp.where(box.upper < most, box.upper, jnp.inf)
+        where(box.lower > -most, box.lower, -jnp.inf), where(box.upper < most, box.upper, jnp.inf)
     )
 
 

@@ -24,6 +24,7 @@ from gsisio_jax.inclusion.rules.linear import add, move, multiple, structural, t
 from gsisio_jax.inclusion.rules.univariate import apply, extremes
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like, is_concrete
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import moderate, times
 
@@ -47,8 +48,8 @@ def multiply(x: Any, y: Any) -> Node:
         cx, cy = x.range.center, y.range.center
         largest = moderate(cx.dtype)
         tame = (jnp.abs(cx) < largest) & (jnp.abs(cy) < largest)
-        cx, cy = jnp.where(tame, cx, 0), jnp.where(tame, cy, 0)
-        spread = jnp.where(tame, times(_radius(x.range, cx), _radius(y.range, cy)), jnp.inf)
+        cx, cy = where(tame, cx, 0), where(tame, cy, 0)
+        spread = where(tame, times(_radius(x.range, cx), _radius(y.range, cy)), jnp.inf)
         form = _envelope(x, y, cx, cy, spread, natural, box)
     node = Node(natural, form, join(chain(y.range, x.jac), chain(x.range, y.jac)), unnormalised=True)
     return meet(node) if x.form is not None and y.form is not None else node
@@ -71,8 +72,8 @@ def bilinear_line(x: Interval, y: Interval, kappa: float) -> tuple[Any, Any, Any
     )
     largest = float(jnp.finfo(p.dtype).max) / 8
     usable = (x.lower > -largest) & (x.upper < largest) & (y.lower > -largest) & (y.upper < largest)
-    cx, rx = (jnp.where(usable, 0.5 * (x.upper + side), 0) for side in (x.lower, -x.lower))
-    cy, ry = (jnp.where(usable, 0.5 * (y.upper + side), 0) for side in (y.lower, -y.lower))
+    cx, rx = (where(usable, 0.5 * (x.upper + side), 0) for side in (x.lower, -x.lower))
+    cy, ry = (where(usable, 0.5 * (y.upper + side), 0) for side in (y.lower, -y.lower))
     return usable, cx, cy, rx * ry, Interval.unchecked(lower, upper)
 
 
@@ -81,7 +82,7 @@ def _radius(a: Interval, center: Any) -> Any:
     if not rounding.outward():
         return a.radius
     far = jnp.maximum(a.upper - center, center - a.lower)
-    return jnp.where(far == 0, 0, rounding.up(far))
+    return where(far == 0, 0, rounding.up(far))
 
 
 def _envelope(x: Node, y: Node, cx: Any, cy: Any, spread: Any, natural: Interval, box: Any) -> Any:
@@ -124,7 +125,7 @@ def divide(x: Any, y: Any) -> Node:
         quotient = multiple(inverse, x, rounded=not plain)
         return _unknown_where(zero, quotient) if zero.any() else quotient
     zero = y == 0
-    return _unknown_where(zero, multiple(1 / jnp.where(zero, 1, y), x, rounded=True))
+    return _unknown_where(zero, multiple(1 / where(zero, 1, y), x, rounded=True))
 
 
 def _unknown_where(mask: Any, x: Node) -> Node:
@@ -133,7 +134,7 @@ def _unknown_where(mask: Any, x: Node) -> Node:
 
 def pick(mask: Any, x: Node, y: Node) -> Node:
     """Elementwise `x` where the mask (not a node) holds, else `y`."""
-    return structural(lambda a, b: jnp.where(mask, a, b), [x, y], [mask])[0]
+    return structural(lambda a, b: where(mask, a, b), [x, y], [mask])[0]
 
 
 def raise_to(x: Any, p: Any) -> Node:
@@ -144,7 +145,7 @@ def raise_to(x: Any, p: Any) -> Node:
     x, p = normalised(x), normalised(p)
     if not is_node(x):
         good = jnp.asarray(x) > 0
-        base = as_node(jnp.where(good, x, 1), p.shape, p.dtype)
+        base = as_node(where(good, x, 1), p.shape, p.dtype)
         return _unknown_where(~good, apply(exp, multiply(p, apply(log, base))))
     result = apply(exp, multiply(p, apply(log, x)))
     # Without knowing that the exponent is no integer, nothing can be said of negative bases.
@@ -229,7 +230,7 @@ def angle(y: Any, x: Any) -> Node:
     form = None
     if box is not None:
         finite = smooth & jnp.isfinite(yl) & jnp.isfinite(yu) & jnp.isfinite(xl) & jnp.isfinite(xu)
-        yl, yu, xl, xu = (jnp.where(finite, v, 1) for v in (yl, yu, xl, xu))
+        yl, yu, xl, xu = (where(finite, v, 1) for v in (yl, yu, xl, xu))
         cy, cx = 0.5 * yl + 0.5 * yu, 0.5 * xl + 0.5 * xu
         square = cx * cx + cy * cy
         sy, sx = cx / square, -cy / square
@@ -251,9 +252,9 @@ def angle(y: Any, x: Any) -> Node:
         )
         linear = box_sum(scaled(sy, y.offset), scaled(sx, x.offset))
         slope, slack = _weighed([(sy, y), (sx, x)], box)
-        slack = None if slack is None else jnp.where(finite, slack, 0)
+        slack = None if slack is None else where(finite, slack, 0)
         offset = choose(finite, box_sum(linear, rest), natural)
-        form = best_form(jnp.where(finite, slope, 0), offset, natural, box, slack, size)
+        form = best_form(where(finite, slope, 0), offset, natural, box, slack, size)
     if jac is None:
         return Node(natural, form)
     over_y = _pull(x.range, y.range, smooth)
@@ -266,17 +267,17 @@ def _safe_root(edge: Any, slope: Any) -> Any:
     """Where the derivative ``edge / (edge^2 + t^2)`` along an edge equals the slope: t >= 0, or 0 if nowhere."""
     edge, slope = jax.lax.stop_gradient(edge), jax.lax.stop_gradient(slope)
     # The square of t is edge * rest; it would vanish where t itself does not.
-    rest = 1 / jnp.where(slope == 0, 1, slope) - edge
+    rest = 1 / where(slope == 0, 1, slope) - edge
     there = (slope != 0) & (edge != 0) & ((rest > 0) == (edge > 0))
-    return jnp.where(there, jnp.sqrt(jnp.where(there, abs(edge), 1)) * jnp.sqrt(jnp.where(there, abs(rest), 1)), 0)
+    return where(there, jnp.sqrt(where(there, abs(edge), 1)) * jnp.sqrt(where(there, abs(rest), 1)), 0)
 
 
 def _angle_at(y: Any, x: Any) -> Any:
     """``atan2`` at a corner, which may lie at infinity or at the origin; ``-0`` counts as 0."""
     y = y + 0.0
     plain = jnp.isfinite(x) & jnp.isfinite(y) & ((x != 0) | (y != 0))
-    smooth = jnp.arctan2(jnp.where(plain, y, 0), jnp.where(plain, x, 1))
-    return jnp.where(plain, smooth, jax.lax.stop_gradient(jnp.arctan2(y, x)))
+    smooth = jnp.arctan2(where(plain, y, 0), where(plain, x, 1))
+    return where(plain, smooth, jax.lax.stop_gradient(jnp.arctan2(y, x)))
 
 
 def _pull(a: Interval, b: Interval, smooth: Any) -> Interval:
@@ -284,10 +285,10 @@ def _pull(a: Interval, b: Interval, smooth: Any) -> Interval:
 
     def at(p: Any, q: Any) -> Any:
         good = smooth & jnp.isfinite(p) & jnp.isfinite(q) & ((p != 0) | (q != 0))
-        p, q = jnp.where(good, p, 0), jnp.where(good, q, 1)
+        p, q = where(good, p, 0), where(good, q, 1)
         # Over the larger one first: squares of the numbers themselves would overflow or vanish. By its reciprocal, as
         # XLA makes one quotient of two, with the square in it that is to be avoided.
-        over = 1 / jax.lax.stop_gradient(jnp.where(abs(p) > abs(q), p, q))
+        over = 1 / jax.lax.stop_gradient(where(abs(p) > abs(q), p, q))
         p, q = p * over, q * over
         return p / jnp.maximum(p * p + q * q, 1) * over
 

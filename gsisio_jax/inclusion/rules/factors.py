@@ -21,6 +21,7 @@ from gsisio_jax.inclusion.rules.possible import formless, unknown
 from gsisio_jax.inclusion.rules.tangents import Tangents
 from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval.box import Interval, choose, entire_like, intersect, magnitude
+from gsisio_jax.interval.direct import where
 
 _MOST_COFACTORS = 6  # rows of a matrix whose determinant is differentiated by its cofactors
 
@@ -97,7 +98,7 @@ def lu(a: Node) -> list[Node]:
     certain = jnp.ones((), bool)
     for k in range(n):
         pivot = normalised(rows[k][k]).range
-        least = jnp.where((pivot.lower <= 0) & (pivot.upper >= 0), 0, jnp.minimum(abs(pivot.lower), abs(pivot.upper)))
+        least = where((pivot.lower <= 0) & (pivot.upper >= 0), 0, jnp.minimum(abs(pivot.lower), abs(pivot.upper)))
         certain &= least > 0
         for i in range(k + 1, n):
             certain &= magnitude(normalised(rows[i][k]).range) < least
@@ -106,9 +107,9 @@ def lu(a: Node) -> list[Node]:
                 rows[i][j] = normalised(subtract(rows[i][j], multiply(rows[i][k], rows[k][j])))
     factors = _matrix(rows)
     nothing = unknown(a.shape, a.dtype, [a])
-    found = structural(lambda p, q: jnp.where(certain, p, q), [factors, nothing], [certain])[0]
+    found = structural(lambda p, q: where(certain, p, q), [factors, nothing], [certain])[0]
     places = np.arange(n, dtype=float)
-    order = Interval.unchecked(jnp.where(certain, places, 0), jnp.where(certain, places, n - 1.0))
+    order = Interval.unchecked(where(certain, places, 0), where(certain, places, n - 1.0))
     jac = None
     if a.jac is not None:
         flat = jnp.zeros((a.jac.lower.shape[0], n))

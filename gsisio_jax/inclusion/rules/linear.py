@@ -48,6 +48,7 @@ from gsisio_jax.inclusion.node import (
 )
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.interval.direct import where
 
 
 def structural(fn: Callable[..., Any], values: Sequence[Any], fixed: Sequence[Any] = (), terms: int = 1) -> list[Node]:
@@ -134,7 +135,7 @@ def _lost(run: Any, along: Any, slopes: Sequence[Any], terms: int) -> Any:
     size = run(along, *map(abs, slopes))
     several = run(along, *((s != 0).astype(s.dtype) for s in slopes)) > 1
     lost = size * np.dtype(size.dtype).type((terms + 1) * float(jnp.finfo(size.dtype).eps))
-    return np.where(several, lost, 0) if is_known(lost) else jax.lax.stop_gradient(jnp.where(several, lost, 0))
+    return np.where(several, lost, 0) if is_known(lost) else jax.lax.stop_gradient(where(several, lost, 0))
 
 
 def _call(fn: Callable[..., Any], *values: Any) -> Any:

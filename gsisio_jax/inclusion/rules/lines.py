@@ -25,6 +25,7 @@ from gsisio_jax.inclusion.rules.functions import CUBE, CURVES, EXP, LOG, RECIPRO
 from gsisio_jax.inclusion.rules.univariate import INF, Curve, calm
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger, smaller
 
 
@@ -60,7 +61,7 @@ def line_of(curve: Any, a: Any, b: Any, kappa: float) -> Line:
     natural = guard(curve.range(a, b))
     s, rest = curve.line(a, b, natural)
     usable = (rest.lower > -INF) & (rest.upper < INF)
-    low, high = jnp.where(usable, rest.lower, 0), jnp.where(usable, rest.upper, 0)
+    low, high = where(usable, rest.lower, 0), where(usable, rest.upper, 0)
     # phi = s t + rest is no larger than the rest and s t together, which is what this bound is used with.
     size = jnp.maximum(abs(low), abs(high))
     natural = Interval.unchecked(
@@ -79,7 +80,7 @@ def _limits(t: Any) -> tuple[float, float]:
 def _positive(t: Any) -> Any:
     """t where it is positive, the smallest normal number elsewhere; a constant for gradients where it is nearly 0."""
     tiny, calm = _limits(t)
-    return jnp.where(t > calm, t, jnp.maximum(jax.lax.stop_gradient(t), tiny))
+    return where(t > calm, t, jnp.maximum(jax.lax.stop_gradient(t), tiny))
 
 
 def _root_line(a: Any, b: Any, kappa: float) -> Line:
@@ -91,11 +92,9 @@ def _root_line(a: Any, b: Any, kappa: float) -> Line:
     floor = rounding.FLUSHED + 4 * below
     inside = b >= 0
     lower = jnp.maximum(rounding.down(u, 4.0 + kappa, floor), 0)
-    natural = Interval.unchecked(
-        jnp.where(inside, lower, -INF), jnp.where(inside, rounding.up(v, 4.0 + kappa, floor), INF)
-    )
+    natural = Interval.unchecked(where(inside, lower, -INF), where(inside, rounding.up(v, 4.0 + kappa, floor), INF))
     usable = inside & (v < INF)
-    v = jnp.where(usable, v, 1)
+    v = where(usable, v, 1)
     total = u + v
     s = 1 / total
     low, high = s * u * v, 0.25 * total
@@ -117,11 +116,11 @@ def _exp_line(a: Any, b: Any, kappa: float) -> Line:
     b = jnp.minimum(b, top)
     u, v = jnp.exp(a), jnp.exp(b)
     lower = jnp.maximum(rounding.down(u, 8.0 + kappa, rounding.FLUSHED), 0)
-    natural = Interval.unchecked(lower, jnp.where(above, INF, rounding.up(v, 8.0 + kappa, rounding.FLUSHED)))
-    u, v = jnp.where(usable, u, 1), jnp.where(usable, v, 1)
+    natural = Interval.unchecked(lower, where(above, INF, rounding.up(v, 8.0 + kappa, rounding.FLUSHED)))
+    u, v = where(usable, u, 1), where(usable, v, 1)
     d = b - a
     wide = d > _narrow(a)
-    s = jnp.where(wide, v - u, 0.5 * (u + v)) / jnp.where(wide, d, 1)
+    s = where(wide, v - u, 0.5 * (u + v)) / where(wide, d, 1)
     s = jnp.maximum(s, float(info.tiny))
     low, high = s - s * jnp.log(s), larger(u - s * a, v - s * b)
     return Line(usable, s, 0.5 * (high + low), 0.5 * (high - low), v, natural, 32.0)
@@ -133,15 +132,15 @@ def _log_line(a: Any, b: Any, kappa: float) -> Line:
     tiny, far = float(jnp.finfo(a.dtype).tiny), float(jnp.finfo(a.dtype).max) / 4
     above, known = b < far, a >= tiny
     missed, usable = b < 0, known & above
-    a, b = _positive(a), _positive(jnp.where(above, b, 1))
+    a, b = _positive(a), _positive(where(above, b, 1))
     u, v = jnp.log(a), jnp.log(b)
     natural = Interval.unchecked(
-        jnp.where(known & ~missed, rounding.down(u, 8.0 + kappa, rounding.FLUSHED), -INF),
-        jnp.where(above & ~missed, rounding.up(v, 8.0 + kappa, rounding.FLUSHED), INF),
+        where(known & ~missed, rounding.down(u, 8.0 + kappa, rounding.FLUSHED), -INF),
+        where(above & ~missed, rounding.up(v, 8.0 + kappa, rounding.FLUSHED), INF),
     )
     d = b - a
     wide = d > _narrow(a) * b
-    s = jnp.where(wide, v - u, 1) / jnp.where(wide, d, 0.5 * (a + b))
+    s = where(wide, v - u, 1) / where(wide, d, 0.5 * (a + b))
     low, high = smaller(u - s * a, v - s * b), -1 - jnp.log(s)
     return Line(usable, s, 0.5 * (high + low), 0.5 * (high - low), abs(u) + abs(v) + 1, natural, 32.0)
 
@@ -152,18 +151,18 @@ def _reciprocal_line(a: Any, b: Any, kappa: float) -> Line:
     ``tiny^-0.45``, or below its inverse) no line is used, so nothing underflows."""
     tiny = float(jnp.finfo(a.dtype).tiny)
     split, left = ((a < 0) & (b > 0)) | ((a == 0) & (b == 0)), b <= 0
-    near, far = jnp.where(left, -b, a), jnp.where(left, -a, b)
+    near, far = where(left, -b, a), where(left, -a, b)
     p, q = 1 / _positive(near), 1 / _positive(far)
     low = jnp.maximum(rounding.down(q, 4.0 + kappa, rounding.FLUSHED), 0)
-    high = jnp.where(near >= tiny, rounding.up(p, 4.0 + kappa, rounding.FLUSHED), INF)
+    high = where(near >= tiny, rounding.up(p, 4.0 + kappa, rounding.FLUSHED), INF)
     natural = Interval.unchecked(
-        jnp.where(split, -INF, jnp.where(left, -high, low)), jnp.where(split, INF, jnp.where(left, -low, high))
+        where(split, -INF, where(left, -high, low)), where(split, INF, where(left, -low, high))
     )
     usable = ~split & (near > tiny**0.45) & (far < tiny**-0.45)
-    p, q = jnp.where(usable, p, 1), jnp.where(usable, q, 1)
+    p, q = where(usable, p, 1), where(usable, q, 1)
     total, touch = p + q, 2 * (jnp.sqrt(p) * jnp.sqrt(q))
     middle = 0.5 * (total + touch)
-    return Line(usable, -(p * q), jnp.where(left, -middle, middle), 0.5 * (total - touch), total, natural)
+    return Line(usable, -(p * q), where(left, -middle, middle), 0.5 * (total - touch), total, natural)
 
 
 def _square_line(a: Any, b: Any, kappa: float) -> Line:
@@ -174,9 +173,9 @@ def _square_line(a: Any, b: Any, kappa: float) -> Line:
     a, b = jnp.maximum(a, -far), jnp.minimum(b, far)
     a, b = jnp.minimum(a, far), jnp.maximum(b, -far)
     p, q = a * a, b * b
-    least, most = jnp.where(inside, 0, smaller(p, q)), larger(p, q)
+    least, most = where(inside, 0, smaller(p, q)), larger(p, q)
     lower = jnp.maximum(rounding.down(least, 4.0 + kappa, rounding.FLUSHED), 0)
-    natural = Interval.unchecked(lower, jnp.where(finite, rounding.up(most, 4.0 + kappa, rounding.FLUSHED), INF))
+    natural = Interval.unchecked(lower, where(finite, rounding.up(most, 4.0 + kappa, rounding.FLUSHED), INF))
     m, r = 0.5 * (a + b), 0.5 * (b - a)
     half = 0.5 * (r * r)
     return Line(finite, 2 * m, half - m * m, half, most, natural, 32.0)
@@ -192,15 +191,15 @@ def _cube_line(a: Any, b: Any, kappa: float) -> Line:
     a, b = jnp.minimum(jnp.maximum(a, -far), far), jnp.minimum(jnp.maximum(b, -far), far)
     p, q = a * a * a, b * b * b
     natural = Interval.unchecked(
-        jnp.where(low, rounding.down(p, 6.0 + kappa, rounding.FLUSHED), -INF),
-        jnp.where(high, rounding.up(q, 6.0 + kappa, rounding.FLUSHED), INF),
+        where(low, rounding.down(p, 6.0 + kappa, rounding.FLUSHED), -INF),
+        where(high, rounding.up(q, 6.0 + kappa, rounding.FLUSHED), INF),
     )
     both = a * b
     s = a * a + b * b + both
     m = jnp.sqrt(jax.lax.stop_gradient(s) * (1 / 3))
     ends, touch = -(both * (a + b)), m * (m * m - s)
-    low = jnp.where((a <= m) & (m <= b), smaller(ends, touch), ends)
-    high = jnp.where((a <= -m) & (-m <= b), larger(ends, -touch), ends)
+    low = where((a <= m) & (m <= b), smaller(ends, touch), ends)
+    high = where((a <= -m) & (-m <= b), larger(ends, -touch), ends)
     return Line(usable, s, 0.5 * (high + low), 0.5 * (high - low), jnp.maximum(abs(p), abs(q)), natural, 64.0)
 
 
@@ -226,15 +225,15 @@ def _bend_line(curve: Curve) -> Callable[[Any, Any, float], Line]:
         natural = Interval.unchecked(lower, upper)
         d = b - a
         wide = d > jnp.maximum(1e-3 * jnp.maximum(abs(a), abs(b)), 1 / far)  # else its derivative overflows
-        secant = jnp.where(wide, v - u, 1) / jnp.where(wide, d, 1)
-        m = jnp.where(wide, contact(jnp.maximum(secant, 1 / far)), abs(0.5 * (a + b)))
+        secant = where(wide, v - u, 1) / where(wide, d, 1)
+        m = where(wide, contact(jnp.maximum(secant, 1 / far)), abs(0.5 * (a + b)))
         s = curve.slope.fn(m)
         m = jax.lax.stop_gradient(m)
         touch = jax.lax.stop_gradient(curve.phi.fn(m)) - s * m
         first, last = u - s * a, v - s * b
         low, high = smaller(first, last), larger(first, last)
-        low = jnp.where((a <= -m) & (-m <= b), smaller(low, 2 * center - touch), low)
-        high = jnp.where((a <= m) & (m <= b), larger(high, touch), high)
+        low = where((a <= -m) & (-m <= b), smaller(low, 2 * center - touch), low)
+        high = where((a <= m) & (m <= b), larger(high, touch), high)
         size = jnp.maximum(abs(u), abs(v))
         return Line(usable, s, 0.5 * (high + low), 0.5 * (high - low), size, natural, ulps)
 

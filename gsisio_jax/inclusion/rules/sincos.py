@@ -29,7 +29,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.primitives import elementwise, fusion_barrier
 
 LIMIT = {"float64": 1.6e6, "float32": 8.0e3, "float16": 1.0, "bfloat16": 1.0}
@@ -88,7 +90,8 @@ def half_sin_cos(r: Any) -> tuple[Any, Any]:
     for the product.
     """
     kind = np.dtype(r.dtype).type
-    sine, cosine = _polynomials(jax.lax.stop_gradient(r) * kind(0.25))
+    quarter = jax.lax.stop_gradient(r) * kind(0.25)
+    sine, cosine = (_polynomials_traced if isinstance(r, Tracer) else _polynomials)(quarter)
     sine, cosine = 2 * sine * cosine, 1 - 2 * sine * sine
     half = r * kind(0.5)
     return _wave(sine, half, cosine), _falling(cosine, half, sine)
@@ -104,11 +107,18 @@ def _polynomials(y: Any) -> tuple[Any, Any]:
     return y + y * (z * p), 1 + z * (kind(-0.5) + z * q)
 
 
+_polynomials_traced = jax.jit(_polynomials, inline=True)
+
+
 def _name(t: Any) -> str:
     return "float32" if t.dtype == jnp.float32 else "float64"
 
 
 def _sin_cos(t: Any) -> tuple[Any, Any]:
+    return _sin_cos_traced(t) if isinstance(t, Tracer) else _sin_cos_of(t)
+
+
+def _sin_cos_of(t: Any) -> tuple[Any, Any]:
     kind = np.dtype(t.dtype).type
     k = jnp.round(t * kind(2 / math.pi))
     y = t
@@ -119,7 +129,11 @@ def _sin_cos(t: Any) -> tuple[Any, Any]:
     quarter = k * kind(0.25)
     quarter = quarter - jnp.floor(quarter)
     odd = (quarter == 0.25) | (quarter == 0.75)
-    first, second = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)
-    sine = jnp.where(quarter >= 0.5, -first, first)
-    cosine = jnp.where((quarter == 0.25) | (quarter == 0.5), -second, second)
+    first, second = where(odd, cosine, sine), where(odd, sine, cosine)
+    sine = where(quarter >= 0.5, -first, first)
+    cosine = where((quarter == 0.25) | (quarter == 0.5), -second, second)
     return fusion_barrier(sine), fusion_barrier(cosine)
+
+
+_sin_cos_traced = jax.jit(_sin_cos_of, inline=True)
+"""What was traced for a type and shape serves all sines."""

@@ -19,6 +19,7 @@ from gsisio_jax.inclusion.rules.trig import crosses
 from gsisio_jax.inclusion.rules.univariate import INF, extremes, rest_of
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger
 
 
@@ -31,10 +32,10 @@ class Tangent:
     def _inside(self, a: Any, b: Any) -> tuple[Any, Any, Any]:
         limit = LIMIT[a.dtype.name]
         whole = (abs(a) < limit) & (abs(b) < limit)
-        a, b = jnp.where(whole, a, 0), jnp.where(whole, b, 0)
+        a, b = where(whole, a, 0), where(whole, b, 0)
         lower, upper = self._blurred(a, b)
         whole &= ~crosses(np.pi / 2, np.pi, lower, upper)
-        return whole, jnp.where(whole, a, 0), jnp.where(whole, b, 0)
+        return whole, where(whole, a, 0), where(whole, b, 0)
 
     def _blurred(self, a: Any, b: Any) -> tuple[Any, Any]:
         """A little more than [a, b]: multiples of pi are known to that accuracy only."""
@@ -53,7 +54,7 @@ class Tangent:
         flat = crosses(0.0, np.pi, *self._blurred(a, b))
         steep = extremes([1 + jnp.tan(a) ** 2, 1 + jnp.tan(b) ** 2])
         lower = jnp.maximum(rounding.down(steep.lower, 2 * self.ulps + 4), 1)
-        steep = Interval.unchecked(jnp.where(flat, 1, lower), rounding.up(steep.upper, 2 * self.ulps + 4))
+        steep = Interval.unchecked(where(flat, 1, lower), rounding.up(steep.upper, 2 * self.ulps + 4))
         return choose(whole, steep, entire_like(a))
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
@@ -67,10 +68,10 @@ class Tangent:
         first = pa - s * a
         lower, upper = self._blurred(a, b)
         inside = (lower <= mirror) & (mirror <= upper)
-        values = [first, pb - s * b, pm - s * m, jnp.where(inside, -pm - s * mirror, first)]
+        values = [first, pb - s * b, pm - s * m, where(inside, -pm - s * mirror, first)]
         # The mirror image of m is off by a few eps (|m| + 1), which counts s times.
         far = jnp.maximum(abs(a), abs(b)) + 1
-        return jnp.where(whole, s, 0), choose(whole, rest_of(values, (pa, pb), s, far, 2 * self.ulps + 16), natural)
+        return where(whole, s, 0), choose(whole, rest_of(values, (pa, pb), s, far, 2 * self.ulps + 16), natural)
 
 
 @dataclass(frozen=True)
@@ -84,13 +85,13 @@ class Pole:
         """Is 0 strictly inside (or all there is, as after a subnormal number was flushed), are we on the left of 0, and
         the interval of |t| (of 1 where 0 is inside)."""
         split, left = ((a < 0) & (b > 0)) | ((a == 0) & (b == 0)), b <= 0
-        near, far = jnp.where(left, -b, a), jnp.where(left, -a, b)
-        return split, left, jnp.where(split, 1, near), jnp.where(split, 1, far)
+        near, far = where(left, -b, a), where(left, -a, b)
+        return split, left, where(split, 1, near), where(split, 1, far)
 
     def _power(self, t: Any, k: int) -> Any:
         """``t ** -k`` for t >= 0, infinite at 0, 0 at infinity."""
         inside = (t > 0) & jnp.isfinite(t)
-        return jnp.where(inside, jnp.where(inside, t, 1) ** -k, jnp.where(t > 0, 0, INF))
+        return where(inside, where(inside, t, 1) ** -k, where(t > 0, 0, INF))
 
     def _between(self, far: Any, near: Any, k: int) -> tuple[Any, Any]:
         """``far ** -k`` rounded down and ``near ** -k`` rounded up; k multiplications and a division, and as many again
@@ -103,11 +104,11 @@ class Pole:
         split, left, near, far = self._side(a, b)
         low, high = self._between(far, near, self.k)
         if self.k % 2:
-            result = Interval.unchecked(jnp.where(left, -high, low), jnp.where(left, -low, high))
+            result = Interval.unchecked(where(left, -high, low), where(left, -low, high))
             return choose(split, entire_like(a), result)
         # An even pole inside: bounded below by the value at the end that is farther from 0.
-        low = jnp.where(split, self._between(larger(-a, b), near, self.k)[0], low)
-        return Interval.unchecked(low, jnp.where(split, INF, high))
+        low = where(split, self._between(larger(-a, b), near, self.k)[0], low)
+        return Interval.unchecked(low, where(split, INF, high))
 
     def derivative(self, a: Any, b: Any) -> Interval:
         split, left, near, far = self._side(a, b)
@@ -115,17 +116,17 @@ class Pole:
         if self.k % 2:
             result = Interval.unchecked(-high, -low)
         else:
-            result = Interval.unchecked(jnp.where(left, low, -high), jnp.where(left, high, -low))
+            result = Interval.unchecked(where(left, low, -high), where(left, high, -low))
         return choose(split, entire_like(a), result)
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
         usable = ((a > 0) | (b < 0)) & jnp.isfinite(a) & jnp.isfinite(b)
-        a, b = jnp.where(usable, a, 1), jnp.where(usable, b, 1)
+        a, b = where(usable, a, 1), where(usable, b, 1)
         m = jnp.sqrt(jnp.abs(a)) * jnp.sqrt(jnp.abs(b))  # touches where the secant of 1/t does
-        m = jnp.where(b < 0, -m, m)
+        m = where(b < 0, -m, m)
         s = -self.k * m ** (-self.k - 1)
         usable &= jnp.isfinite(s) & (m != 0)
-        s = jnp.where(usable, s, 0)
+        s = where(usable, s, 0)
         m = jax.lax.stop_gradient(m)
         pa, pb = a**-self.k, b**-self.k
         values = [pa - s * a, pb - s * b, jax.lax.stop_gradient(m**-self.k) - s * m]
@@ -140,36 +141,36 @@ class Hinge:
     left: float
 
     def _at(self, t: Any) -> Any:
-        return jnp.where(t < 0, -t if self.left else jnp.zeros_like(t), t)
+        return where(t < 0, -t if self.left else jnp.zeros_like(t), t)
 
     def range(self, a: Any, b: Any) -> Interval:
         if not self.left:
             return Interval.unchecked(self._at(a), self._at(b))
         ends = extremes([self._at(a), self._at(b)])
-        return Interval.unchecked(jnp.where((a < 0) & (b > 0), 0, ends.lower), ends.upper)
+        return Interval.unchecked(where((a < 0) & (b > 0), 0, ends.lower), ends.upper)
 
     def derivative(self, a: Any, b: Any) -> Interval:
         # The Clarke hull at 0 itself; on a box that ends there every difference quotient is that of its side.
         one = jnp.ones_like(a)
         right, left = (a > 0) | ((a == 0) & (b > 0)), (b < 0) | ((b == 0) & (a < 0))
-        return Interval.unchecked(jnp.where(right, one, self.left), jnp.where(left, self.left * one, one))
+        return Interval.unchecked(where(right, one, self.left), where(left, self.left * one, one))
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
         low, high = jnp.isfinite(a), jnp.isfinite(b)
         bent = (a < 0) & (b > 0)
         # Narrower than this, a secant has no gradient; any slope is as good.
         cut = bent & low & high & (b - a > float(jnp.finfo(a.dtype).tiny) ** 0.25)
-        a0, b0 = jnp.where(cut, a, -1), jnp.where(cut, b, 1)
+        a0, b0 = where(cut, a, -1), where(cut, b, 1)
         s = (b0 - self.left * a0) / (b0 - a0)
         # With one end infinite the slope of the infinite side leaves a bounded rest; with both, nothing does.
-        s = jnp.where(cut, s, jnp.where(high & ~low, self.left, 1.0))
-        s = jnp.where(bent, s, jnp.where(b <= 0, self.left, 1.0))
-        rest_a = jnp.where(low & bent, (self.left - s) * jnp.where(low, a, 0), 0)
-        rest_b = jnp.where(high & bent, (1 - s) * jnp.where(high, b, 0), 0)
+        s = where(cut, s, where(high & ~low, self.left, 1.0))
+        s = where(bent, s, where(b <= 0, self.left, 1.0))
+        rest_a = where(low & bent, (self.left - s) * where(low, a, 0), 0)
+        rest_b = where(high & bent, (1 - s) * where(high, b, 0), 0)
         rest = extremes([rest_a, rest_b, jnp.zeros_like(rest_a)])
         if rounding.outward():
             # Linear on either side of 0, where it is 0, so only the two products round; and only where s is no integer.
-            loss = jnp.where(cut, rounding.error(4 * jnp.maximum(abs(a0), abs(b0))), 0)
+            loss = where(cut, rounding.error(4 * jnp.maximum(abs(a0), abs(b0))), 0)
             rest = Interval.unchecked(rest.lower - loss, rest.upper + loss)
         both = bent & ~low & ~high
-        return jnp.where(both, 0, s), choose(both, natural, rest)
+        return where(both, 0, s), choose(both, natural, rest)

@@ -15,6 +15,7 @@ import numpy as np
 from gsisio_jax.inclusion.rules.sincos import LIMIT, SLOT, half_sin_cos, sin_cos
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import fusion_barrier
 
@@ -58,7 +59,7 @@ class Wave:
         value, radius = sin_cos(m)[self.cosine], r
         if rounding.outward():
             radius = r + rounding.error(abs(m) + r + (1.0 if self.cosine else 0.0), 8 * SLOT)
-        radius = jnp.where(usable, radius, 2)
+        radius = where(usable, radius, 2)
         return Interval.unchecked(larger(value - radius, -1), smaller(value + radius, 1))
 
     def derivative(self, a: Any, b: Any, parts: _WaveParts | None = None) -> Interval:
@@ -75,14 +76,14 @@ class Wave:
         shift = s * m
         lower, upper = smaller(value, even) - odd - shift, larger(value, even) + odd - shift
         rest = _wave_padded(Interval.unchecked(lower, upper), self.cosine, m, r)
-        return jnp.where(usable, s, 0), choose(usable, rest, natural)
+        return where(usable, s, 0), choose(usable, rest, natural)
 
 
 def _middle(a: Any, b: Any) -> tuple[Any, Any, Any]:
     """Is [a, b] within less than a period and near enough for `sin_cos`; middle and half-width, 0 where it is not."""
     m, r = 0.5 * a + 0.5 * b, 0.5 * b - 0.5 * a
     usable = (r < 0.5 * _PERIOD) & (abs(m) + r < LIMIT[a.dtype.name])  # not where either is infinite or NaN
-    return usable, fusion_barrier(jnp.where(usable, m, 0)), fusion_barrier(jnp.where(usable, r, 0))
+    return usable, fusion_barrier(where(usable, m, 0)), fusion_barrier(where(usable, r, 0))
 
 
 def _wave_padded(exact: Interval, cosine: bool, m: Any, r: Any) -> Interval:
@@ -122,8 +123,8 @@ def _wave_range(cosine: bool, sign: float, parts: _WaveParts) -> Interval:
     even, odd = value * turned, jnp.abs(steepness) * 2 * half_sin * half_cos
     pad = _wave_loss(cosine, m, r)
     limit, odd = (turned, odd) if pad is None else (turned - pad, odd + pad)
-    lower = jnp.where(usable & (-value < limit), even - odd, -1)
-    upper = jnp.where(usable & (value < limit), even + odd, 1)
+    lower = where(usable & (-value < limit), even - odd, -1)
+    upper = where(usable & (value < limit), even + odd, 1)
     return Interval.unchecked(jnp.maximum(lower, -1), jnp.minimum(upper, 1))
 
 
@@ -138,7 +139,7 @@ def wave_atom(cosine: bool, m: Any, r: Any, size: Any, terms: int) -> tuple[Any,
     """
     kind = np.dtype(m.dtype).type
     usable = (r < 0.5 * _PERIOD) & (size < LIMIT[m.dtype.name])  # not where either is infinite or NaN
-    m, r = jnp.where(usable, m, 0), jnp.where(usable, r, 0)
+    m, r = where(usable, m, 0), where(usable, r, 0)
     (sine, other), (half_sin, half_cos) = sin_cos(m), half_sin_cos(r)
     value, steepness = (other, -sine) if cosine else (sine, other)
     pad: Any = kind(0)
@@ -155,12 +156,12 @@ def wave_atom(cosine: bool, m: Any, r: Any, size: Any, terms: int) -> tuple[Any,
     radius = abs(bent) + odd + pad
     half = 2 * steep * half_sin * half_cos + pad
     limit = turned - pad
-    lower = jnp.where(usable & (-value < limit), even - half, -1)
-    upper = jnp.where(usable & (value < limit), even + half, 1)
+    lower = where(usable & (-value < limit), even - half, -1)
+    upper = where(usable & (value < limit), even + half, 1)
     natural = Interval.unchecked(larger(lower, -1), smaller(upper, 1))
-    middle = jnp.where(usable, value, 0), jnp.where(usable, pad, 1)
-    slope, center = jnp.where(usable, slope, 0), jnp.where(usable, center, 0)
-    return slope, center, jnp.where(usable, radius, everything), natural, middle
+    middle = where(usable, value, 0), where(usable, pad, 1)
+    slope, center = where(usable, slope, 0), where(usable, center, 0)
+    return slope, center, where(usable, radius, everything), natural, middle
 
 
 def wave_point(cosine: bool, t: Any, size: Any, terms: int) -> tuple[Any, Any]:
@@ -168,9 +169,9 @@ def wave_point(cosine: bool, t: Any, size: Any, terms: int) -> tuple[Any, Any]:
     by its own rounding, and for rows of that many terms."""
     kind = np.dtype(t.dtype).type
     usable = size < LIMIT[t.dtype.name]
-    value = sin_cos(jnp.where(usable, t, 0))[cosine]
+    value = sin_cos(where(usable, t, 0))[cosine]
     pad: Any = kind(0)
     if rounding.outward():
-        size = jax.lax.stop_gradient(jnp.where(usable, size, 0)) + kind(cosine)
+        size = jax.lax.stop_gradient(where(usable, size, 0)) + kind(cosine)
         pad = rounding.error(size, 8 * SLOT + 3 * (2 * terms + 16), rounding.FLUSHED)
-    return value, jnp.where(usable, pad, 2)
+    return value, where(usable, pad, 2)

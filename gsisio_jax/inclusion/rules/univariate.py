@@ -34,6 +34,7 @@ from gsisio_jax.inclusion.node import POINT_MODE, Node, best_form, chain, normal
 from gsisio_jax.inclusion.rules.trig import Wave
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, computed_once, entire_like
+from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import fusion_barrier, times
 
@@ -63,7 +64,7 @@ def apply(curve: Any, x: Node) -> Node:
         s, rest = fusion_barrier(s), computed_once(rest)
         slope, offset = s * x.form.slope, x.form.offset
         up = s >= 0
-        first, last = (times(s, jnp.where(mask, offset.lower, offset.upper)) for mask in (up, ~up))
+        first, last = (times(s, where(mask, offset.lower, offset.upper)) for mask in (up, ~up))
         lower, upper, size, slack = first + rest.lower, last + rest.upper, 0, None
         if rounding.outward():
             lower = rounding.lowered(lower, abs(first) + abs(lower), 2.0)
@@ -81,7 +82,7 @@ def apply(curve: Any, x: Node) -> Node:
 def calm(t: Any) -> Any:
     """t, whose gradient next to 0 is 0, as it is at 0 itself: the derivative of a root is infinite there, and what
     rounding makes of a zero would come back as NaN from a product of a few of those."""
-    return jnp.where(abs(t) < float(jnp.finfo(t.dtype).tiny) ** 0.25, jax.lax.stop_gradient(t), t)
+    return where(abs(t) < float(jnp.finfo(t.dtype).tiny) ** 0.25, jax.lax.stop_gradient(t), t)
 
 
 def extremes(values: list[Any]) -> Interval:
@@ -128,11 +129,11 @@ class Piece:
             inside &= jnp.abs(t) < self.overflow(float(jnp.finfo(t.dtype).max))
         if self.turn == INF or self.turn == -INF:
             inside &= t != 0
-        value = self.fn(jnp.where(inside, t, self.inner))
-        limit = self.ends[0] if self.ends[0] == self.ends[1] else jnp.where(t < self.inner, *self.ends)
+        value = self.fn(where(inside, t, self.inner))
+        limit = self.ends[0] if self.ends[0] == self.ends[1] else where(t < self.inner, *self.ends)
         if self.turn == INF or self.turn == -INF:
-            limit = jnp.where(t == 0, self.turn, limit)
-        return jnp.where(inside, value, limit)
+            limit = where(t == 0, self.turn, limit)
+        return where(inside, value, limit)
 
     def range(self, a: Any, b: Any) -> Interval:
         """Exact range on ``[a, b]``, padded; everything where that interval misses the domain."""
@@ -144,9 +145,9 @@ class Piece:
         else:
             result, turns = extremes([pa, pb]), (a < 0) & (b > 0)
             if self.trend == "valley":
-                result = Interval.unchecked(jnp.where(turns, self.turn, result.lower), result.upper)
+                result = Interval.unchecked(where(turns, self.turn, result.lower), result.upper)
             else:
-                result = Interval.unchecked(result.lower, jnp.where(turns, self.turn, result.upper))
+                result = Interval.unchecked(result.lower, where(turns, self.turn, result.upper))
         result = self._padded(result, self.ulps_on(a, b))
         low, high = self.domain
         if low > -INF or high < INF:
@@ -221,7 +222,7 @@ class Curve:
         low, high = self.phi.domain
         a, b = larger(a, low), smaller(b, high)
         finite = jnp.isfinite(a) & jnp.isfinite(b) & (a <= b)
-        a, b = jnp.where(finite, a, self.phi.inner), jnp.where(finite, b, self.phi.inner)
+        a, b = where(finite, a, self.phi.inner), where(finite, b, self.phi.inner)
         pa, pb = self.phi.at(a), self.phi.at(b)
         m = 0.5 * a + 0.5 * b
         even = self.slope.trend in ("valley", "peak")
@@ -229,21 +230,21 @@ class Curve:
             least = float(jnp.finfo(a.dtype).tiny) ** 0.25  # on shorter ones the derivative of a secant overflows
             wide = b - a > jnp.maximum(_NARROW * jnp.maximum(jnp.abs(a), jnp.abs(b)), least)
             wide &= jnp.isfinite(pa) & jnp.isfinite(pb)
-            secant = jnp.where(wide, pb - pa, 1.0) / jnp.where(wide, b - a, 1.0)
+            secant = where(wide, pb - pa, 1.0) / where(wide, b - a, 1.0)
             # Contacts are powers of the secant: where it is extreme, they or their gradients would overflow.
             largest = float(jnp.finfo(a.dtype).max) ** 0.25
             wide &= (jnp.abs(secant) < largest) & (jnp.abs(secant) > 1 / largest)
-            touch = self.contact(jnp.where(wide, secant, 1.0))
-            touch = jnp.where(m < 0, -touch, touch) if even else jnp.clip(touch, a, b)
-            m = jnp.where(wide, touch, m)
+            touch = self.contact(where(wide, secant, 1.0))
+            touch = where(m < 0, -touch, touch) if even else jnp.clip(touch, a, b)
+            m = where(wide, touch, m)
         s = self.slope.at(m)
         usable = finite & jnp.isfinite(s)
-        s = jnp.where(usable, s, 0)
+        s = where(usable, s, 0)
         first = pa - s * a
         values = [first, pb - s * b]
         m = jax.lax.stop_gradient(m)
         for t in (m, -m) if even else (m,):
-            values.append(jnp.where((a <= t) & (t <= b), jax.lax.stop_gradient(self.phi.at(t)) - s * t, first))
+            values.append(where((a <= t) & (t <= b), jax.lax.stop_gradient(self.phi.at(t)) - s * t, first))
         far = jnp.maximum(abs(a), abs(b))
         ulps = jnp.maximum(self.phi.ulps_on(a, b), self.slope.ulps_on(a, b)) if self.drifts else self.ulps
         rest = rest_of(values, (pa, pb), s, far, ulps)
