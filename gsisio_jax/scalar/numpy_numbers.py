@@ -11,7 +11,6 @@ import numpy as np
 
 from gsisio_jax.scalar.graph import Number, is_constant
 from gsisio_jax.scalar.numpy_operations import operation_of, plain
-from gsisio_jax.scalar.numpy_source import source
 from gsisio_jax.scalar.program import ScalarProgram, bound
 from gsisio_jax.scalar.unroll import ArrayOperation
 
@@ -28,7 +27,9 @@ class Operations(Protocol):
     """What a program is appended to (`numpy_program`)."""
 
     def place(self, value: Any = None) -> int: ...
-    def append(self, function: Any, operands: list[int], given: Any, found: Any, text: Any = None) -> list[int]: ...
+    def append(
+        self, function: Any, operands: list[int], given: Any, found: Any, primitive: Any = None
+    ) -> list[int]: ...
     def equation(self, eqn: Any, operands: list[int]) -> list[int]: ...
     def add(self, jaxpr: Any, consts: Sequence[Any], inputs: list[int]) -> list[int]: ...
 
@@ -51,8 +52,7 @@ def add_numbers(into: Operations, program: ScalarProgram, inputs: Sequence[int])
         kinds, found = [Kind((), value.dtype) for value in given], [Kind((), dtype)]
         params = number.equation.params if number is not None and number.equation is not None else {}
         params = {"new_dtype": dtype} if name == "convert_element_type" else params
-        function, text = _function(name, number, params, kinds), source(name, params, kinds, found)
-        return into.append(function, [*map(of, given)], kinds, found, text)[0]
+        return into.append(_function(name, number, params, kinds), [*map(of, given)], kinds, found, (name, params))[0]
 
     for number in program.operations:
         operands, name = number.operands, number.name

@@ -15,7 +15,7 @@ import numpy as np
 from gsisio_jax._collector import rare_collection
 from gsisio_jax.scalar.numpy_numbers import SAME, add_numbers, has_numbers_of_numpy
 from gsisio_jax.scalar.numpy_operations import numpy_operation, plain
-from gsisio_jax.scalar.numpy_source import Operation, as_code, source
+from gsisio_jax.scalar.numpy_source import Operation, as_code
 from gsisio_jax.scalar.primitive import numbers_of, written
 from gsisio_jax.scalar.unroll import called_jaxpr
 
@@ -111,9 +111,7 @@ class _Program:
         if _is_same(eqn):
             return operands[:1]
         given, found = ([v.aval for v in group] for group in (eqn.invars, eqn.outvars))
-        return self.append(
-            _operation(eqn), operands, given, found, source(eqn.primitive.name, eqn.params, given, found)
-        )
+        return self.append(_operation(eqn), operands, given, found, (eqn.primitive.name, eqn.params))
 
     def drop_unused(self) -> None:
         """Leave operations out whose results nothing needs."""
@@ -137,7 +135,7 @@ class _Program:
 
     def append(
         self, function: Callable[..., Sequence[Any]], operands: list[int], given: Sequence[Any], found: Sequence[Any],
-        text: str | None = None,
+        primitive: tuple[str, Any] | None = None,
     ) -> list[int]:  # fmt: skip
         """An operation on values of kinds `given`, with results of kinds `found`; at once where its operands are
         known."""
@@ -145,7 +143,7 @@ class _Program:
         if all(value is not None for value in known):
             return [self.place(value) for value in function(*known)]
         results = [self.place() for _ in found]
-        self.operations.append(Operation(function, operands, results, given, found, text))
+        self.operations.append(Operation(function, operands, results, given, found, primitive))
         return results
 
 

@@ -17,15 +17,15 @@ from gsisio_jax.scalar.numpy_layout import filled, layout_source, spread
 
 
 class Operation(NamedTuple):
-    """Values at `operands` to those at `results`, of these kinds (anything with `shape` and `dtype`); where Python
-    has an expression for it, also as that."""
+    """Values at `operands` to those at `results`, of these kinds (anything with `shape` and `dtype`); where it is a
+    primitive, its name and parameters: Python may have an expression for it."""
 
     function: Callable[..., Sequence[Any]]
     operands: list[int]
     results: list[int]
     given: Sequence[Any]
     found: Sequence[Any]
-    source: str | None = None
+    primitive: tuple[str, Any] | None = None
 
 
 _NUMBERS = {
@@ -116,8 +116,9 @@ def as_code(
             known[f"v{place}"] = value  # random keys stay with JAX
     lines = [f"def program({', '.join(f'v{place}' for place in inputs)}):"]
     lines += [f" v{i} = {name}(v{i})" for i, kind in zip(inputs, kinds, strict=True) if (name := _python(kind))]
-    for i, (function, operands, results, given, found, text) in enumerate(operations):
+    for i, (function, operands, results, given, found, primitive) in enumerate(operations):
         names = [f"v{place}" for place in operands]
+        text = source(*primitive, given, found) if primitive else None
         if text:
             lines.append(f" v{results[0]} = {text.format(*names)}")
             continue
