@@ -21,6 +21,7 @@ from oracles import uncompiled_calls
 from oracles.uncompiled_calls import MOST
 from oracles.uncompiled_calls import in_numpy as in_numpy
 
+from gsisio_jax.interval.cast import as_array
 from gsisio_jax.observer import estimation
 from gsisio_jax.scalar.numpy_program import numpy_function, numpy_program
 from gsisio_jax.scalar.program import ScalarProgram
@@ -54,7 +55,7 @@ def _through_numpy(compiled: Callable[..., Any]) -> Callable[..., Any]:
         if static is None or (y.ndim == 2 and len(y) > MOST):
             return compiled(static, traced, box, y, u, noise, hold)
         leaves, structure = jax.tree.flatten((traced, box, y, u, noise))
-        leaves = [jax.numpy.asarray(leaf) for leaf in leaves]
+        leaves = [as_array(leaf) for leaf in leaves]
         key = compiled, static, hold, structure, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
         if key not in _programs:
             function = partial(compiled.__wrapped__, static, hold=hold)  # type: ignore[attr-defined]
@@ -118,11 +119,11 @@ def _size(along: Sequence[int | None], shapes: Sequence[tuple[int, ...]]) -> int
 
 
 def _in_numpy(*args: Any, program: _Traced, axes: Any) -> list[Any]:
-    return [jax.numpy.asarray(value) for value in _values([np.asarray(arg) for arg in args], program, axes)]
+    return [as_array(value) for value in _values([np.asarray(arg) for arg in args], program, axes)]
 
 
 def _batch(args: Any, dims: Any, *, program: _Traced, axes: Any) -> tuple[list[Any], list[int]]:
-    args = [arg if axis is None else jax.numpy.moveaxis(arg, axis, 0) for arg, axis in zip(args, dims, strict=True)]
+    args = [jax.numpy.moveaxis(arg, axis, 0) if axis else arg for arg, axis in zip(args, dims, strict=True)]
     along = tuple(None if axis is None else 0 for axis in dims)
     out = _numpy.bind(*args, program=program, axes=(*axes, along))
     return out, [0] * len(out)
