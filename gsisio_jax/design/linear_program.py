@@ -6,7 +6,8 @@ it (and to import than all of a small design). Here an expression is a matrix wh
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import clarabel
 import numpy as np
@@ -16,42 +17,71 @@ _TOLERANCE = 1e-11
 _SOLVED = ("Solved", "AlmostSolved")  # what comes of it is checked, not believed
 
 
+class Entries(NamedTuple):
+    """A matrix of coefficients: `value` at (`row`, `column`); what stands at one place counts together.
+
+    SciPy's matrices check and sort themselves at every operation, which takes longer than the operation.
+    """
+
+    row: np.ndarray
+    column: np.ndarray
+    value: np.ndarray
+
+    def sorted(self) -> Entries:
+        """By their rows."""
+        order = np.argsort(self.row, kind="stable")
+        return Entries(self.row[order], self.column[order], self.value[order])
+
+
 class Expression:
     """A matrix (or vector) of numbers that are linear in the unknowns of a program.
 
     Attributes:
-        rows: sparse (entries, unknowns so far), entries in C order.
+        entries: their rows are the numbers in C order, their columns the unknowns.
         offset: array of the shape of the expression.
     """
 
     __array_ufunc__ = None  # NumPy leaves arithmetic to this class
 
-    def __init__(self, rows: Any, offset: np.ndarray):
-        self.rows, self.offset = rows, offset
+    def __init__(self, entries: Entries, offset: np.ndarray):
+        self.entries, self.offset = entries, offset
 
     @property
     def shape(self) -> tuple[int, ...]:
         return self.offset.shape
 
     def __getitem__(self, key: Any) -> Expression:
-        picked = np.arange(self.offset.size).reshape(self.shape)[key]
-        return Expression(self.rows[picked.ravel()], self.offset[key])
+        picked = np.arange(self.offset.size).reshape(self.shape)[key].ravel()
+        given = self.entries.sorted()
+        counts = np.bincount(given.row, minlength=self.offset.size)
+        index = _runs((np.cumsum(counts) - counts)[picked], counts[picked])
+        rows = np.repeat(np.arange(picked.size), counts[picked])
+        return Expression(Entries(rows, given.column[index], given.value[index]), self.offset[key])
 
     def __matmul__(self, matrix: np.ndarray) -> Expression:
-        lead, offset = self.shape[:-1], self.offset @ matrix
-        if not self.offset.size or not offset.size:
-            return Expression(sparse.csr_array((offset.size, self.rows.shape[1])), offset)
-        right = sparse.csr_array(np.reshape(matrix, (self.shape[-1], -1)).T)
-        return Expression(_along_diagonal(right, int(np.prod(lead))) @ self.rows, offset)
+        offset = self.offset @ matrix
+        right = np.reshape(matrix, (self.shape[-1], math.prod(np.shape(matrix)[1:])))
+        lead, last = np.divmod(self.entries.row, self.shape[-1] or 1)
+        begin, to = np.nonzero(right)
+        counts = np.bincount(begin, minlength=len(right))
+        each = counts[last]
+        index = _runs((np.cumsum(counts) - counts)[last], each)
+        return Expression(
+            Entries(
+                np.repeat(lead * right.shape[1], each) + to[index],
+                np.repeat(self.entries.column, each),
+                np.repeat(self.entries.value, each) * right[begin, to][index],
+            ),
+            offset,
+        )
 
     def __add__(self, other: Any) -> Expression:
         if not isinstance(other, Expression):
-            return Expression(self.rows, self.offset + other)
-        width = max(self.rows.shape[1], other.rows.shape[1])
-        return Expression(_wide(self.rows, width) + _wide(other.rows, width), self.offset + other.offset)
+            return Expression(self.entries, self.offset + other)
+        return Expression(Entries(*map(np.append, self.entries, other.entries)), self.offset + other.offset)
 
     def __neg__(self) -> Expression:
-        return Expression(-self.rows, -self.offset)
+        return Expression(self.entries._replace(value=-self.entries.value), -self.offset)
 
     def __sub__(self, other: Any) -> Expression:
         return self + (-other)
@@ -64,11 +94,15 @@ class Expression:
 
     def sum(self, axis: int | None = None) -> Expression:
         """Sum of all entries, or along an axis."""
-        order = np.arange(self.offset.size).reshape(self.shape)
-        groups = order.reshape(1, -1) if axis is None else np.moveaxis(order, axis, -1)
-        groups = groups.reshape(-1, groups.shape[-1])
-        add = _ones(groups.ravel(), groups.shape[1] * np.arange(len(groups) + 1), self.offset.size)
-        return Expression(add @ self.rows, np.asarray(self.offset.sum(axis)))
+        offset = np.asarray(self.offset.sum(axis))
+        place = np.arange(offset.size).reshape(offset.shape)
+        place = np.broadcast_to(place if axis is None else np.expand_dims(place, axis), self.shape).ravel()
+        return Expression(self.entries._replace(row=place[self.entries.row]), offset)
+
+    def at(self, x: np.ndarray) -> np.ndarray:
+        """The numbers for these values of the unknowns."""
+        of, column, value = self.entries
+        return np.bincount(of, value * x[column], self.offset.size).reshape(self.shape) + self.offset
 
 
 class LinearProgram:
@@ -83,7 +117,8 @@ class LinearProgram:
         """New unknowns."""
         size, start = int(np.prod(shape)), self._count
         self._count += size
-        return Expression(_ones(start + np.arange(size), np.arange(size + 1), self._count), np.zeros(shape))
+        place = np.arange(size)
+        return Expression(Entries(place, start + place, np.ones(size)), np.zeros(shape))
 
     def absolute(self, value: Any) -> Any:
         """Numbers at or above the absolute values of an expression."""
@@ -105,10 +140,13 @@ class LinearProgram:
     def minimise(self, goal: Expression, *wanted: Expression) -> list[np.ndarray] | None:
         """Values of the wanted expressions at the minimum; None where Clarabel claims none."""
         constraints = [*self._zero, *self._nonnegative]
-        A = sparse.csc_array(-sparse.vstack([_wide(c.rows, self._count) for c in constraints]))
+        ends = np.cumsum([c.offset.size for c in constraints])
+        rows = np.concatenate([c.entries.row + end - c.offset.size for c, end in zip(constraints, ends, strict=True)])
+        columns, values = (np.concatenate([c.entries[part] for c in constraints]) for part in (1, 2))
+        A = sparse.csc_array((-values, (rows, columns)), (ends[-1], self._count))
         A.eliminate_zeros()
         b = np.concatenate([c.offset.ravel() for c in constraints])
-        q = _wide(goal.rows, self._count).toarray().ravel()
+        q = np.bincount(goal.entries.column, goal.entries.value, self._count)
         sizes = (sum(c.offset.size for c in part) for part in (self._zero, self._nonnegative))
         kinds: Any = clarabel
         cones = [kinds.ZeroConeT(next(sizes)), kinds.NonnegativeConeT(next(sizes))]
@@ -118,32 +156,18 @@ class LinearProgram:
         if str(found.status) not in _SOLVED:
             return None
         x = np.asarray(found.x)
-        return [(_wide(w.rows, self._count) @ x).reshape(w.shape) + w.offset for w in wanted]
+        return [w.at(x) for w in wanted]
 
 
 def diagonal(values: Expression) -> Expression:
     """The diagonal matrix of a vector."""
-    n = values.shape[0]
-    place = _ones(np.arange(n), (np.arange(n * n + 1) + n) // (n + 1), n)
-    return Expression(place @ values.rows, np.diag(values.offset))
+    rows = values.entries.row * (values.shape[0] + 1)
+    return Expression(values.entries._replace(row=rows), np.diag(values.offset))
 
 
-def _ones(columns: np.ndarray, ends: np.ndarray, width: int) -> Any:
-    """Rows with ones at these columns, row r at those from ends[r] to ends[r+1]: SciPy's forms by coordinates sort."""
-    return sparse.csr_array((np.ones(len(columns)), columns, ends), (len(ends) - 1, width))
-
-
-def _along_diagonal(block: Any, count: int) -> Any:
-    """`count` copies of a sparse matrix along the diagonal of a larger one."""
-    (height, width), copies = block.shape, np.arange(count)[:, None]
-    columns = (block.indices + width * copies).ravel()
-    ends = np.append((block.indptr[:-1] + block.nnz * copies).ravel(), block.nnz * count)
-    return sparse.csr_array((np.tile(block.data, count), columns, ends), (height * count, width * count))
-
-
-def _wide(rows: Any, width: int) -> Any:
-    """The same rows for more unknowns."""
-    return sparse.csr_array((rows.data, rows.indices, rows.indptr), (rows.shape[0], width))
+def _runs(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Indices first[i], first[i] + 1, ..., so many of each, one run behind the other."""
+    return np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
 def _settings() -> Any:
