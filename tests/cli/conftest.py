@@ -200,7 +200,7 @@ def float64_as_before() -> Iterator[None]:
 _designs: dict[Any, Any] = {}
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def designed_once() -> Iterator[None]:
     """Commands that ask for the same observer, of one plant with equal bounds and options, get it from one design."""
     design = gx.design_observer
