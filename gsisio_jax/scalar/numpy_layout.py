@@ -62,12 +62,28 @@ def layout_source(name: str, params: Any, given: Sequence[Any], out: Any) -> str
         return f"concatenate(({_all(given)})).reshape({shape})" if params["axis"] == 0 else None
     if name == "convert_element_type" and params["new_dtype"].name in _TYPES:
         return f"{{0}}.astype({_TYPES[params['new_dtype'].name]})"
-    if name == "reduce_sum" and x.dtype.kind == "f":
-        return f"add.reduce({{0}}, {_plain(params['axes'])})"
+    if name == "dynamic_slice" and params["slice_sizes"]:
+        # As XLA does: a slice that would leave the array begins earlier.
+        sizes = enumerate(zip(x.shape, _plain(params["slice_sizes"]), strict=True))
+        starts = ((f"(i{k} := min(max(int({{{k + 1}}}), 0), {all_ - size}))", k, size) for k, (all_, size) in sizes)
+        return _index(f"{first}:i{k} + {size}" for first, k, size in starts)
+    if name in _REDUCED and x.dtype.name in _TYPES and all(x.shape[axis] for axis in params["axes"]):
+        return _reduced(name, x.dtype, _plain(params["axes"]))
     return _product(params, x, given[1], out) if name == "dot_general" else None
 
 
 _TYPES = {"float64": "float64", "float32": "float32", "int32": "int32", "int64": "int64", "bool": "bool_"}
+
+
+_REDUCED = {"reduce_sum": "add", "reduce_max": "maximum", "reduce_min": "minimum", "reduce_and": "", "reduce_or": ""}
+
+
+def _reduced(name: str, dtype: Any, axes: tuple[int, ...]) -> str | None:
+    """Of no entries, and of the bits of whole numbers: as NumPy's functions have it."""
+    if name in ("reduce_and", "reduce_or"):
+        return f"{{0}}.{'all' if name == 'reduce_and' else 'any'}({axes})" if dtype.kind == "b" else None
+    wide = f", {dtype.name}" if name == "reduce_sum" and dtype.kind == "i" else ""
+    return f"{_REDUCED[name]}.reduce({{0}}, {axes}{wide})" if dtype.kind in "fi" else None
 
 
 def _plain(sizes: Any) -> tuple[int, ...]:

@@ -51,6 +51,7 @@ _ARRAYS = {name: _NUMBERS[name] for name in (
     "is_finite": "isfinite({0})", "not": "~{0}", "floor": "floor({0})", "ceil": "ceil({0})",
     "scale": "where({0} == 0, {0}.dtype.type(0), {0} * {1})", "nextafter": "nextafter({0}, {1})",
 }  # fmt: skip
+_DOUBLE_ARRAYS = {"times": "where((p := {0} * {1}) == p, p, 0.0)"}
 FLOATING_ONLY = {"div", "sign", "abs", "neg", "sqrt", "square", "floor", "ceil", "is_finite", "scale", "times"}
 _WHOLE = {"add", "add_any", "sub", "mul"}  # of truth values Python's are counts
 _NAMES: dict[str, Any] = {name: getattr(np, name) for name in (
@@ -73,8 +74,8 @@ def source(name: str, params: Any, given: Sequence[Any], found: Sequence[Any]) -
     if name == "integer_pow" and first.kind == "f" and params["y"] in (2, 3):
         return "{0} * {0}" if params["y"] == 2 else "{0} * ({0} * {0})"
     if out.shape or any(kind.shape for kind in given):
-        alike = all(kind.shape == out.shape for kind in given)
-        text = _ARRAYS.get(name) if alike else None
+        text = _ARRAYS.get(name) if _spreads(given, out) and (given[0].shape or name != "scale") else None
+        text = _DOUBLE_ARRAYS.get(name, text) if first == np.float64 and _spreads(given, out) else text
         return text or _as_number(layout_source(name, params, given, out), out)
     if name == "convert_element_type":
         return _converted(first, out.dtype)
@@ -83,6 +84,14 @@ def source(name: str, params: Any, given: Sequence[Any], found: Sequence[Any]) -
     if name == "times" and first == np.float32:
         return "p if (p := {0} * {1}) == p else zero_float32"
     return (_DOUBLES.get(name) if first == np.float64 else None) or _NUMBERS.get(name)
+
+
+def _spreads(given: Sequence[Any], out: Any) -> bool:
+    """Whether NumPy's own spreading of numbers and short axes along arrays gives the result its shape and type."""
+    try:
+        return np.broadcast_shapes(*(kind.shape for kind in given)) == out.shape and len({k.dtype for k in given}) == 1
+    except ValueError:
+        return False
 
 
 def _as_number(text: str | None, out: Any) -> str | None:

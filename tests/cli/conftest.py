@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
+import gsisio_jax as gx
 from gsisio_jax.cli import main
 
 MODEL = '''\
@@ -193,6 +195,28 @@ def float64_as_before() -> Iterator[None]:
     before = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     yield
     jax.config.update("jax_enable_x64", before)
+
+
+_designs: dict[Any, Any] = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def designed_once() -> Iterator[None]:
+    """Commands that ask for the same observer, of one plant with equal bounds and options, get it from one design."""
+    design = gx.design_observer
+
+    def once(system: Any, noise: Any, region: Any, progress: bool | None = None, **options: Any) -> Any:
+        leaves, structure = jax.tree.flatten((system, noise, region, options))
+        values = [leaf if isinstance(leaf, str) else (np.asarray(leaf).dtype, np.shape(leaf)) for leaf in leaves]
+        numbers = tuple(np.asarray(leaf).tobytes() for leaf in leaves)
+        key = structure, tuple(values), numbers, jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+        if key not in _designs or progress:
+            _designs[key] = design(system, noise, region, progress=progress, **options)
+        return _designs[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gx, "design_observer", once)
+        yield
 
 
 @pytest.fixture

@@ -186,26 +186,32 @@ def test_progress_appears_only_when_asked_or_on_a_terminal(project, monkeypatch)
 
 def test_help_and_version_need_no_extra():
     code = (
-        "import sys\n"
+        "import contextlib, io, json, sys\n"
         "for name in ('pandas', 'xarray', 'pydantic', 'rich', 'matplotlib', 'netCDF4'): sys.modules[name] = None\n"
         "from gsisio_jax.cli import main\n"
-        "sys.exit(main(sys.argv[1:]))\n"
+        "def call(words):\n"
+        "    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()) as err:\n"
+        "        try:\n"
+        "            code = main(words)\n"
+        "        except SystemExit as stop:\n"
+        "            code = stop.code or 0\n"
+        "    return code, out.getvalue(), err.getvalue()\n"
+        "print(json.dumps([call(words) for words in json.loads(sys.argv[1])]))\n"
     )
-
-    def call(*arguments):
-        done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
-        return done.returncode, done.stdout, done.stderr
-
-    returned, out, _ = call("--version")
-    assert returned == 0
-    assert out.startswith("gsisio ")
-    for arguments in (["--help"], ["estimate", "--help"]):
-        returned, out, _ = call(*arguments)
+    words = [["--version"], ["--help"], ["estimate", "--help"], ["estimate", "flight"], ["design", "flight"]]
+    done = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(words)], capture_output=True, text=True, check=True
+    )  # fmt: skip
+    version, *helps, estimate, design = json.loads(done.stdout)
+    assert done.stderr == ""
+    assert version[0] == 0
+    assert version[1].startswith("gsisio ")
+    for returned, out, _ in helps:
         assert returned == 0
         assert "gsisio estimate flight" in out
     line = "gsisio: the command line needs {}; install it with: pip install 'gsisio_jax[cli]'\n"
-    assert call("estimate", "flight") == (2, "", line.format("pandas"))
-    assert call("design", "flight") == (2, "", line.format("pydantic"))
+    assert estimate == [2, "", line.format("pandas")]
+    assert design == [2, "", line.format("pydantic")]
 
 
 COMPASS = """\

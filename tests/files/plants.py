@@ -81,7 +81,7 @@ def design(kind):
         case "window":
             return systems.s1().design(window=2, sweeps=1, missing=False)
         case "planes":
-            return systems.s1().design(missing=False, bounds=("affine", "abstraction"))
+            return systems.s1().design(missing=False, sweeps=1, window=1, bounds=("affine", "abstraction"))
         case "bounded":
             return gx.design_observer(plant, NOISE, Interval([0.1, -2.0], [4.0, 2.0]), u_region=ball(1.0), window=1)
         case "turning":

@@ -74,6 +74,7 @@ def engine() -> Model:
         d=lambda k: 20.0 + 15.0 * jnp.sin(0.1 * k)[:, None],  # N m
         u=lambda k, x: jnp.array([0.5]) + 0.1 * jnp.sin(0.03 * k),
         u_region=Interval([0.3], [0.7]),
+        design={"window": 1},  # what "auto" finds
         wide=[0.02, 0.04],
     )
 

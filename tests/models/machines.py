@@ -50,6 +50,7 @@ def arm() -> Model:
         d=lambda k: jnp.stack([2.0 * jnp.sin(0.1 * k), jnp.where(k % 50 < 5, 5.0, 0.0)], axis=1),  # rad/s2
         u=controller,
         u_region=Interval([-15.0, -15.0], [15.0, 15.0]),
+        design={"window": 1},  # what "auto" finds
         wide=[4e-3, 4e-3, 0.1, 0.1],
     )
 
@@ -74,6 +75,7 @@ def _drive(friction, w) -> Model:
         d=lambda k: 0.2 * jnp.sin(0.1 * k)[:, None],  # N m
         u=lambda k, x: jnp.array([1.0]) * jnp.sin(0.05 * k),
         u_region=Interval([-1.0], [1.0]),
+        design={"window": 1},  # what "auto" finds
         wide=[2e-3, 0.2],
     )
 
@@ -120,8 +122,7 @@ def attitude() -> Model:
         region=Interval(start - 0.07, start + 0.07),
         u=lambda k, x: 0.003 * jnp.array([jnp.sin(0.2 * k), jnp.cos(0.15 * k), jnp.sin(0.1 * k)]),
         u_region=symmetric(0.003, 0.003, 0.003),
-        design={"missing": True},
-        wide=[0.15] * 4,
+        wide=[0.03] * 4,
     )
 
 

@@ -38,6 +38,7 @@ def cstr() -> Model:
         d=lambda k: 3.0 * jnp.sin(0.1 * k)[:, None],  # K
         u=lambda k, x: jnp.array([300.0]) + 1.0 * jnp.sin(0.05 * k),
         u_region=Interval([299.0], [301.0]),
+        design={"window": 1},  # what "auto" finds
         wide=[0.05, 0.25],
     )
 
@@ -67,6 +68,7 @@ def dead_zone_tank() -> Model:
         d=lambda k: 1e-3 * (1 + jnp.sin(0.07 * k))[:, None],  # m3/s
         u=lambda k, x: jnp.array([0.3]) + 0.25 * jnp.sin(0.05 * k),
         u_region=Interval([0.0], [1.0]),
+        design={"window": 1},  # what "auto" finds
         wide=[0.02, 0.005],
     )
 

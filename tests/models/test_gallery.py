@@ -1,5 +1,7 @@
 """Models as an engineer writes them: no state and no unknown input outside its box, and useful boxes."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from models.gallery import MODELS
@@ -11,11 +13,16 @@ BOTH_PRECISIONS = ("battery", "heading", "engine")
 BOTH_ROUNDINGS = ("sir", "cstr")
 
 
+@cache
+def designed(name):
+    """Of a model: itself, its observer, and its runs."""
+    model = MODELS[name]()
+    return model, model.observer(), records(model)
+
+
 @pytest.mark.parametrize("name", MODELS)
 def test_model(name):
-    model = MODELS[name]()
-    observer = model.observer()
-    runs = records(model)
+    model, observer, runs = designed(name)
     for run in runs:
         boxes = estimate(model, observer, run)
         assert boxes.guaranteed
@@ -38,8 +45,8 @@ def test_model(name):
 
 def test_a_wrong_model_is_seen():
     """The counts above can fail: states that are moved by more than the measurements allow lie outside."""
-    model = MODELS["sir"]()
-    run = records(model)[1]
-    boxes = estimate(model, model.observer(), run)
+    model, observer, runs = designed("sir")
+    run = runs[1]
+    boxes = estimate(model, observer, run)
     moved = run.x + np.asarray(model.noise.v.width)[0] * 3
     assert misses(type(run)(moved, run.d, run.u, run.y), boxes) > 0

@@ -110,7 +110,7 @@ def range_only() -> Model:
         d=lambda k: 0.5 * jnp.stack([jnp.cos(0.05 * k), jnp.sin(0.05 * k)], axis=1),  # m/s
         u=lambda k, x: jnp.array([1.0, 0.1 * k]),
         u_region=Interval([1.0, 0.0], [1.0, 20.0]),
-        design={"missing": True},
+        design={"missing": True, "window": 1},
         wide=[15.0, 15.0],
     )
 
@@ -144,6 +144,7 @@ def range_bearing() -> Model:
         d=lambda k: 0.5 * jnp.sin(0.1 * k)[:, None],  # rad/s
         u=lambda k, x: jnp.array([0.5, 0.5]),
         u_region=Interval([0.5, 0.5], [0.5, 0.5]),
+        design={"window": 1},  # what "auto" finds
         wide=[0.3, 0.3, 0.15],
     )
 
@@ -165,6 +166,7 @@ def heading() -> Model:
         initial=symmetric(10.0, 10.0, 0.3),
         region=Interval([-INF, -INF, -INF], [INF, INF, INF]),
         d=lambda k: 0.1 * (1 + jnp.sin(0.1 * k))[:, None],  # rad/s
+        design={"window": 1},  # what "auto" finds
         wide=[6.0, 6.0, 0.04],
     )
 
