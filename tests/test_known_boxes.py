@@ -9,6 +9,7 @@ import gsisio_jax as gx
 from gsisio_jax import Interval, inclusion
 from gsisio_jax.inclusion.known_boxes import case_is_open, in_numpy
 from gsisio_jax.interval.cast import as_array
+from gsisio_jax.scalar.numpy_program import numpy_function as program
 
 COMPILED = True  # about what is compiled, and what is not
 BOX = Interval(np.array([-0.3, 0.2, 1.0]), np.array([0.7, 1.1, 2.5]))
@@ -49,15 +50,33 @@ def test_nothing_is_compiled_and_the_bounds_are_those_of_a_compiled_function(way
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_function_that_holds_a_traced_number(way):
+    """In a trace, which a program of NumPy comes of, for each number; what XLA makes of one is compared above."""
+
     def lower(p):
         found = getattr(inclusion, way)(lambda x: jnp.stack([p * x[0] + x[1], x[1] * x[2]]))(BOX)
         return getattr(found, "range", found).lower.ravel()[0]
 
+    p = np.array([2.0, 3.0, 2.0 + 1e-6, 2.0 - 1e-6])
+    expected = [float(lower(number)) for number in p]
+    traced = program(lower, 2.0)
+    np.testing.assert_allclose([traced(number) for number in p], expected, rtol=1e-12)
+    np.testing.assert_allclose(program(jax.vmap(lower), p)(p), expected, rtol=1e-12)
+    slope = float(program(jax.grad(lower), 2.0)(2.0))
+    assert slope == pytest.approx((expected[2] - expected[3]) / 2e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("way", ["natural", "mean_value"])
+def test_a_function_that_holds_a_number_that_is_traced_alone(way):
+    """Under `jax.vmap` and `jax.grad` outside of any trace, and under `jax.jit`: through both doors to NumPy, that of a
+    function (natural) and that of its bounds (mean_value)."""
+
+    def lower(p):
+        return getattr(inclusion, way)(lambda x: jnp.stack([p * x[0] + x[1], x[1] * x[2]]))(BOX).lower[0]
+
     expected = [float(lower(p)) for p in (2.0, 3.0)]
     np.testing.assert_allclose([jax.jit(lower)(p) for p in (2.0, 3.0)], expected, rtol=1e-12)
     np.testing.assert_allclose(jax.vmap(lower)(np.array([2.0, 3.0])), expected, rtol=1e-12)
-    slope = float(jax.grad(lower)(2.0))
-    assert slope == pytest.approx(float(lower(2.0 + 1e-6) - lower(2.0 - 1e-6)) / 2e-6, abs=1e-6)
+    assert float(jax.grad(lower)(2.0)) == pytest.approx(BOX.lower[0], abs=1e-6)
 
 
 def test_a_point_stays_a_point():
