@@ -79,7 +79,7 @@ def test_they_are_quick():
         asked.append(sides)
         return usual(*sides)
 
-    from jax._src.numpy import ufuncs  # noqa: PLC0415
+    from jax._src.numpy import ufuncs
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ufuncs, "add", add)
