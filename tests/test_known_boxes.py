@@ -1,5 +1,7 @@
 """Bounds on boxes whose numbers are known: in NumPy, without a single compilation, and those of a compiled function."""
 
+from contextlib import contextmanager
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ import gsisio_jax as gx
 from gsisio_jax import Interval, inclusion
 from gsisio_jax.inclusion.known_boxes import case_is_open, in_numpy
 from gsisio_jax.interval.cast import as_array
+from gsisio_jax.scalar.numpy_program import numpy_function as program
 
 COMPILED = True  # about what is compiled, and what is not
 BOX = Interval(np.array([-0.3, 0.2, 1.0]), np.array([0.7, 1.1, 2.5]))
@@ -20,26 +23,41 @@ def plain(x):
     return jnp.stack([x[0] * x[1] - 0.3 * x[2], x[2] / (1.0 + x[0] ** 2), jnp.where(x[1] > 0.5, x[0], x[2])])
 
 
-@pytest.mark.parametrize("way", WAYS)
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_nothing_is_compiled_and_the_bounds_are_those_of_a_compiled_function(way, dtype):
+@pytest.fixture(scope="module", params=[np.float64, np.float32])
+def of_all_ways(request):
+    """Bounds, and what was compiled for them; before anything else is, so that nothing is there already."""
     jax.clear_caches()
+    box, found = BOX.astype(request.param), {}
+    for way in WAYS:
+        bounds = getattr(inclusion, way)(plain)
+        with compilations() as compiled:
+            found[way] = bounds, bounds(box), compiled
+    return box, found
+
+
+@contextmanager
+def compilations():
     compiled = []
 
     def listen(event, seconds, **_):
         if "backend_compile" in event:
             compiled.append(event)
 
-    box = Interval(BOX.lower.astype(dtype), BOX.upper.astype(dtype))
-    bounds = getattr(inclusion, way)(plain)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        found = bounds(box)
-        assert compiled == []
-        expected = jax.jit(bounds)(box)
-        assert compiled  # the counter does count
+        yield compiled
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_nothing_is_compiled_and_the_bounds_are_those_of_a_compiled_function(way, of_all_ways):
+    box, (bounds, found, compiled) = of_all_ways[0], of_all_ways[1][way]
+    dtype = box.dtype
+    assert compiled == []
+    with compilations() as counted:
+        expected = jax.jit(bounds)(box)
+    assert counted  # the counter does count
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert isinstance(ours, jax.Array)
@@ -49,15 +67,33 @@ def test_nothing_is_compiled_and_the_bounds_are_those_of_a_compiled_function(way
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_function_that_holds_a_traced_number(way):
+    """In a trace, which a program of NumPy comes of, for each number; what XLA makes of one is compared above."""
+
     def lower(p):
         found = getattr(inclusion, way)(lambda x: jnp.stack([p * x[0] + x[1], x[1] * x[2]]))(BOX)
         return getattr(found, "range", found).lower.ravel()[0]
 
+    p = np.array([2.0, 3.0, 2.0 + 1e-6, 2.0 - 1e-6])
+    expected = [float(lower(number)) for number in p]
+    traced = program(lower, 2.0)
+    np.testing.assert_allclose([traced(number) for number in p], expected, rtol=1e-12)
+    np.testing.assert_allclose(program(jax.vmap(lower), p)(p), expected, rtol=1e-12)
+    slope = float(program(jax.grad(lower), 2.0)(2.0))
+    assert slope == pytest.approx((expected[2] - expected[3]) / 2e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize("way", ["natural", "mean_value"])
+def test_a_function_that_holds_a_number_that_is_traced_alone(way):
+    """Under `jax.vmap` and `jax.grad` outside of any trace, and under `jax.jit`: through both doors to NumPy, that of a
+    function (natural) and that of its bounds (mean_value)."""
+
+    def lower(p):
+        return getattr(inclusion, way)(lambda x: p * x)(BOX).lower[0]
+
     expected = [float(lower(p)) for p in (2.0, 3.0)]
     np.testing.assert_allclose([jax.jit(lower)(p) for p in (2.0, 3.0)], expected, rtol=1e-12)
     np.testing.assert_allclose(jax.vmap(lower)(np.array([2.0, 3.0])), expected, rtol=1e-12)
-    slope = float(jax.grad(lower)(2.0))
-    assert slope == pytest.approx(float(lower(2.0 + 1e-6) - lower(2.0 - 1e-6)) / 2e-6, abs=1e-6)
+    assert float(jax.grad(lower)(2.0)) == pytest.approx(BOX.lower[0], abs=1e-6)
 
 
 def test_a_point_stays_a_point():

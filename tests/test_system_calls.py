@@ -13,6 +13,7 @@ from gsisio_jax import Interval
 
 ONE: Any = {"G": np.zeros((1, 0)), "H": np.zeros((1, 0))}
 SMALL = gx.Noise(Interval([-0.01], [0.01]), Interval([-0.1], [0.1]))
+QUICK: Any = {"missing": False, "certify": False, "window": 1, "sweeps": 1}  # what is not looked at here
 
 
 def _x(x):
@@ -49,7 +50,7 @@ class _Model:
 def _boxes(system, u):
     """Boxes of a run without noise, and the truth."""
     observer = gx.design_observer(
-        system, SMALL, region=Interval([-20.0], [20.0]), u_region=Interval([-9.0], [9.0]), missing=False
+        system, SMALL, region=Interval([-20.0], [20.0]), u_region=Interval([-9.0], [9.0]), **QUICK
     )
     x = [np.array([1.0])]
     for row in u[:-1]:
@@ -146,7 +147,7 @@ def test_integers_are_numbers():
 
 def test_u_of_the_wrong_length_is_refused():
     observer = gx.design_observer(
-        gx.System(_both, _x, **ONE, m=1), SMALL, region=Interval([-1.0], [1.0]), u_region=Interval([-1.0], [1.0])
+        gx.System(_both, _x, **ONE, m=1), SMALL, Interval([-1.0], [1.0]), u_region=Interval([-1.0], [1.0]), **QUICK
     )
     start, y = Interval([-1.0], [1.0]), np.zeros((3, 1))
     for u in (np.zeros((2, 1)), np.zeros((3, 2)), np.zeros(3), None):
@@ -181,7 +182,7 @@ def test_numbers_that_change_behind_a_system_are_noticed(place):
             "helper": lambda x: 2 * helper(x),
         }[place]
     system = gx.System((lambda x: f.gain @ x) if place == "object" else f, _x, **ONE)
-    observer = gx.design_observer(system, SMALL, region=_region(), missing=False)
+    observer = gx.design_observer(system, SMALL, region=_region(), **QUICK)
     y = np.zeros((3, 1))
     gx.estimate(observer, _region(), y)
     A[0, 0] = 0.9
@@ -204,7 +205,7 @@ def test_one_function_before_and_after_a_change_makes_two_systems():
     widths = []
     for value in (0.5, 0.0):
         A[0, 0] = value
-        observer = gx.design_observer(gx.System(f, _x, **ONE), SMALL, region=_region(), missing=False)
+        observer = gx.design_observer(gx.System(f, _x, **ONE), SMALL, region=_region(), **QUICK)
         wide = Interval([-100.0], [100.0])
         widths.append(float(gx.estimate(observer, wide, np.full((2, 1), np.nan)).state.width[1, 0]))
     assert widths[0] == pytest.approx(100.02)
@@ -219,7 +220,7 @@ def test_what_a_function_counts_by_itself_is_no_change():
         calls += 1
         return 0.5 * x
 
-    observer = gx.design_observer(gx.System(f, _x, **ONE), SMALL, region=_region(), missing=False)
+    observer = gx.design_observer(gx.System(f, _x, **ONE), SMALL, region=_region(), **QUICK)
     gx.estimate(observer, _region(), np.zeros((2, 1)))
     assert calls > 0
 

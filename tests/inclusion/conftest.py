@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from oracles.quick_operators import quick_operators
 from oracles.uncompiled import is_about_xla
 from oracles.uncompiled_bounds import bounds_in_numpy
 
@@ -26,5 +27,5 @@ def in_numpy(request: pytest.FixtureRequest) -> Iterator[None]:
     if is_about_xla(request):
         yield
     else:
-        with bounds_in_numpy():
+        with bounds_in_numpy(), quick_operators():
             yield

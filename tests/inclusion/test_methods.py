@@ -36,8 +36,14 @@ def forms(planes):
     corners[1:4, 1] = corners[1:4, 0]  # points
     boxes, u = Interval(corners[:, 0], corners[:, 1]), random.uniform(-1, 1, (40, 1))
     subsets = [(name,) for name in METHODS] + [("affine", "natural"), ("natural", "mean_value"), METHODS]
-    found = {s: in_numpy(jax.vmap(bound(curved, s, planes)))(boxes, u) for s in subsets}
-    return boxes, u, found
+    return boxes, u, {s: one_by_one(bound(curved, s, planes), boxes, u) for s in subsets}
+
+
+def one_by_one(bounds, boxes, u):
+    """`jax.vmap` of bounds, whose trace takes twice as long as that of one box."""
+    program = in_numpy(bounds)
+    found = [program(boxes[i], u[i]) for i in range(len(u))]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *found)
 
 
 def samples(boxes, u):
@@ -86,15 +92,12 @@ def test_observers_with_other_bounds_still_contain_the_truth():
     """Each on its own: without the default ones the boxes are wider, never wrong."""
     case = systems.s1()
     small = Interval([-0.1, -0.1], [0.1, 0.1])
-    width = {}
+    sims = jax.vmap(lambda key: gx.simulate(case.system, key, jnp.zeros(2), jnp.zeros((20, 2)), case.noise))(
+        jax.random.split(jax.random.key(1), 50)
+    )
+    d, width = np.zeros((50, 20, 2)), {}
     for methods in (("affine", "natural"), ("natural", "abstraction"), ("decomposition", "mean_value")):
-        observer = case.design(bounds=methods, missing=False).with_rounding("nearest")
-        sims, d = (
-            jax.vmap(lambda key: gx.simulate(case.system, key, jnp.zeros(2), jnp.zeros((20, 2)), case.noise))(
-                jax.random.split(jax.random.key(1), 50)
-            ),
-            np.zeros((50, 20, 2)),
-        )
+        observer = case.design(bounds=methods, missing=False, certify=False).with_rounding("nearest")
         estimates = jax.vmap(lambda y: gx.estimate(observer, small, y))(sims.y)  # noqa: B023
         assert estimates.state.contains(sims.x[:, :-1], -1e-12).all()
         assert estimates.input.contains(d[:, :-1], -1e-12).all()
