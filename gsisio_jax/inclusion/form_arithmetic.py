@@ -47,7 +47,7 @@ def fold(call: Any, *values: Any) -> Any:
         hash(call)
     except TypeError:  # parameters, or what it holds, have no hash
         return numpy_function(call, *values)(*values)
-    return _folded(call, kinds, bool(jax.config.jax_enable_x64))(*values)
+    return _folded(call, kinds, bool(jax.config.read("jax_enable_x64")))(*values)
 
 
 @lru_cache(512)
