@@ -119,8 +119,9 @@ def test_a_direction_that_slopes_hide_is_explained():
     for words in ("A smaller region about the same centre alone does not help", "more outputs", "certify=False"):
         assert words in text, text
     bounded = plant(Interval([-20.0] * 2, [20.0] * 2))
-    gx.design_observer(bounded, _noise(2, 3, 1e-3), region=region, missing=False)
-    free = gx.design_observer(system, _noise(2, 3, 1e-3), region=region, missing=False, certify=False)
+    quick = {"missing": False, "window": 1, "sweeps": 1}
+    gx.design_observer(bounded, _noise(2, 3, 1e-3), region=region, **quick)
+    free = gx.design_observer(system, _noise(2, 3, 1e-3), region=region, certify=False, **quick)
     assert not free.certificate.certified
     assert "singular values" in str(free.certificate)
 
@@ -130,7 +131,8 @@ def test_state_bounds_that_were_given_are_not_asked_for():
     bounds = Interval([-20.0] * 2, [20.0] * 2)
     region = Interval([4.5, 3.5], [5.5, 4.5])
     system = gx.System(lambda x: x, _ranges(ANCHORS), G=0.1 * np.eye(2), H=np.zeros((3, 2)), state_bounds=bounds)
-    observer = gx.design_observer(system, _noise(2, 3, 1e-3), region=region, missing=False)
+    quick = {"missing": False, "window": 1, "sweeps": 1}
+    observer = gx.design_observer(system, _noise(2, 3, 1e-3), region=region, **quick)
     x = np.array([5.0, 4.0])
     y = np.repeat(np.asarray(_ranges(ANCHORS)(x))[None], 5, axis=0)
     est = gx.estimate(observer, Interval(x - 0.4, x + 0.4), y)
@@ -139,7 +141,7 @@ def test_state_bounds_that_were_given_are_not_asked_for():
     without = gx.System(lambda x: x, _ranges(ANCHORS), G=0.1 * np.eye(2), H=np.zeros((3, 2)))
     with pytest.raises(gx.NoDesignFound, match="finite for states 1, 2, which the unknown input reaches"):
         gx.design_observer(without, _noise(2, 3, 1e-3), region=region, missing=False)
-    free = gx.design_observer(without, _noise(2, 3, 1e-3), region=region, missing=False, certify=False)
+    free = gx.design_observer(without, _noise(2, 3, 1e-3), region=region, certify=False, **quick)
     est = gx.estimate(free, Interval(x - 0.4, x + 0.4), y)
     assert _contains(est.state, x)
 

@@ -81,7 +81,8 @@ def exactly(function: Callable[..., Any], kind: type, lower: np.ndarray, upper: 
 def bounds_of(function: Callable[..., Any], kind: type, rounding: Any = "outward") -> Callable[..., Interval]:
     natural = inclusion.natural(lambda x: function(x, lambda value: jnp.asarray(value, kind)), rounding)
     # Constants as arrays are known to the interpreter; they are the numbers that `exactly` takes.
-    return jax.jit(jax.vmap(lambda lower, upper: natural(Interval.unchecked(lower, upper))))
+    bounds = jax.jit(jax.vmap(lambda lower, upper: natural(Interval.unchecked(lower, upper))))
+    return lambda lower, upper: jax.device_get(bounds(lower, upper))
 
 
 def missed(name: str, kind: type, rounding: Any = "outward") -> int:
