@@ -182,7 +182,7 @@ def test_bounded_nonlinearities_count_as_noise():
     A = np.array([[0.9, 0.3], [-0.3, 0.8]])
     system = gx.System(lambda x: A @ x + 0.1 * jnp.sin(x), lambda x: x[:1], G=np.zeros((2, 0)), H=np.zeros((1, 0)))
     noise = gx.Noise(Interval.symmetric([0.01, 0.01]), Interval.symmetric([0.05]))
-    observer = gx.design_observer(system, noise, Interval.symmetric([3.0, 3.0]), certify=False)
+    observer = gx.design_observer(system, noise, Interval.symmetric([3.0, 3.0]), certify=False, sweeps=1, window=1)
     rng = np.random.default_rng(0)
     x, states, seen = rng.uniform(-50, 50, (200, 2)), [], []
     for _ in range(6):
