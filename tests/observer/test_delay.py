@@ -49,7 +49,7 @@ def simulated(name, seed, size=3.0, vertices=False, steps=STEPS):
 
 @pytest.fixture(scope="module")
 def spring():
-    return designed("spring")
+    return designed("spring", sweeps=1)
 
 
 @pytest.fixture(scope="module")
