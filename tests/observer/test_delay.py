@@ -207,7 +207,7 @@ def test_a_nonlinear_spring():
 
 def test_batches_and_gradients(record):
     """Speed from two positions is (4 v + 2 w1) / .1 wide for radii w1 and v."""
-    y, spring = record[1], designed("spring", missing=False, sweeps=1)
+    y, spring = record[1], designed("spring", missing=False, sweeps=1, window=1)
 
     def width(scale):
         bounds = gx.Noise(Interval.symmetric(scale * jnp.array([1e-3, 1e-2])), spring.noise.v)
