@@ -65,8 +65,14 @@ def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) ->
 
     def enclose(box: Interval, u: Interval) -> list[Interval]:
         T2_array = jnp.asarray(np.asarray(T2), dtype)
-        maps = (system.dynamics, system.measurement, lambda x, u: T2_array @ system.measurement(x, u))
-        return [inclusion.jacobian(q)(box, u) for q in maps]
+
+        def outputs(x: Any, u: Any) -> Any:
+            """g and T2 g: what they share is followed once."""
+            y = system.measurement(x, u)
+            return jnp.concatenate([y, T2_array @ y])
+
+        of_f, of_g = (inclusion.jacobian(q)(box, u) for q in (system.dynamics, outputs))
+        return [of_f, of_g[: system.l], of_g[system.l :]]
 
     program = _traced_once(enclose)
 
