@@ -142,7 +142,8 @@ def test_a_state_without_bounds_has_one_slice():
     )  # fmt: skip
     noise = gx.Noise(Interval.symmetric([0.01, 0.05]), Interval.symmetric([0.1]))
     region = Interval([-np.inf, -1.0], [np.inf, 1.0])
-    plain, cut = (gx.design_observer(system, noise, region, missing=False, window=1, split=s).certificate for s in (1, 8))
+    fast = {"missing": False, "window": 1}
+    plain, cut = (gx.design_observer(system, noise, region, split=s, **fast).certificate for s in (1, 8))
     assert (cut.steady_width < 0.999 * plain.steady_width).all()
     np.testing.assert_allclose(cut.next_width(cut.steady_width, noise), cut.steady_width, rtol=1e-6)
     # The slope of x1 on x2 changes its sign: half an interval of the steepest part, twice.
