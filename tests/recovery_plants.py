@@ -67,7 +67,7 @@ def design(plant):
     A, C, G, H, w, v = plant
     system = gx.System(lambda x: A @ x, lambda x: C @ x, G=G, H=H)
     noise = gx.Noise(Interval.symmetric(w), Interval.symmetric(v))
-    return gx.design_observer(system, noise, Interval.symmetric(np.full(len(A), 5.0)), certify=False)
+    return gx.design_observer(system, noise, Interval.symmetric(np.full(len(A), 5.0)), certify=False, sweeps=1)
 
 
 def records(name, seeds, rows=ROWS, size=1.0):

@@ -29,7 +29,7 @@ def run():
         lambda x: x, _outputs, G=0.1 * np.eye(2), H=np.zeros((4, 2)), state_bounds=Interval.symmetric([20.0, 20.0])
     )
     noise = gx.Noise(Interval.symmetric([0.002, 0.002]), Interval.symmetric(NOISE))
-    observer = gx.design_observer(system, noise, Interval.symmetric([10.0, 10.0]), missing=False, sweeps=2)
+    observer = gx.design_observer(system, noise, Interval.symmetric([10.0, 10.0]), missing=False, sweeps=1)
     assert observer.cells == (8, 8)  # by default: see `with_cells`
     assert "cells=64, chosen as outputs are bent: the box of state 1 would stay 40 wide" in str(observer.certificate)
     generator = np.random.default_rng(0)
@@ -73,7 +73,7 @@ def test_boxes_of_a_few_metres_in_small_bounds_are_cut_as_well():
     system = gx.System(lambda x: x, outputs, G=np.eye(2), H=np.zeros((4, 2)), state_bounds=bounds)
     noise = gx.Noise(Interval.symmetric([0.01, 0.01]), Interval.symmetric(NOISE))
     region = Interval([10.0, 10.0], [30.0, 30.0])
-    observer = gx.design_observer(system, noise, region, missing=False, sweeps=2, window=1)
+    observer = gx.design_observer(system, noise, region, missing=False, sweeps=1, window=1)
     assert observer.cells == (8, 8)
     # What straight outputs leave, against the set that agrees: outputs are nearly straight on a tenth of a metre.
     at = np.array([20.0, 20.0])

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from angles import TURN
+from oracles import uncompiled
 
 import gsisio_jax as gx
 from gsisio_jax import Interval, Status
@@ -17,6 +18,14 @@ from gsisio_jax.observer import cells
 
 RUNS, STEPS = 64, 12
 ball = Interval.symmetric
+
+
+@pytest.fixture(autouse=True, scope="module")
+def all_records_at_once():
+    """A step of cells takes ten milliseconds by itself, and hardly more over arrays of all records."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(uncompiled, "MOST_SECONDS", 0)
+        yield
 
 
 def draws(rng, radius, vertices):
@@ -62,10 +71,10 @@ def exact_hulls(grid, start, agrees, moved, w):
     """
     alive = np.tile((start.lower <= grid) & (grid <= start.upper), (RUNS, 1))
     low, high = [], []
+    near = (abs(moved[:, None] - grid) <= w - (grid[1] - grid[0])).astype(np.float32)  # whole numbers are exact
     for k in range(STEPS):
         if k:
-            near = abs(grid[:, None] - moved) <= w - (grid[1] - grid[0])
-            alive = (alive.astype(float) @ near.T.astype(float)) > 0
+            alive = (alive.astype(np.float32) @ near) > 0
         alive = alive & agrees[:, k]
         low.append(np.where(alive.any(1), grid[alive.argmax(1)], np.nan))
         high.append(np.where(alive.any(1), grid[len(grid) - 1 - alive[:, ::-1].argmax(1)], np.nan))

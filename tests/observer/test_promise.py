@@ -24,7 +24,7 @@ def test_widths_keep_the_promise_from_any_box_of_the_region():
         state_bounds=Interval([0.0, 0], [200.0, 200]),
         input_bounds=Interval.symmetric([2.0, 2]),
     )
-    observer = gx.design_observer(system, NOISE, Interval(LOWER, UPPER), missing=False, sweeps=1)
+    observer = gx.design_observer(system, NOISE, Interval(LOWER, UPPER), missing=False, sweeps=1, window=1)
     assert observer.certificate.self_consistent
     assert observer.certificate.implicit_rate > 0.8
 
@@ -72,7 +72,8 @@ def test_a_gain_of_the_new_measurement_alone_needs_no_past():
     system = gx.System(
         lambda x: x, lambda x: jnp.stack([x[0] + x[1] / 3, x[1] / 3, x[0] - x[1] / 7]), G=np.eye(2), H=np.zeros((3, 2))
     )
-    observer = gx.design_observer(system, gx.Noise(ball(0.1, 2), ball(0.2, 3)), Interval.entire(2), missing=False)
+    noise = gx.Noise(ball(0.1, 2), ball(0.2, 3))
+    observer = gx.design_observer(system, noise, Interval.entire(2), missing=False, sweeps=1, window=1)
     boxes = gx.estimate(observer, Interval.entire(2), np.zeros((2, 3)))
     assert np.isfinite(boxes.state.width).all()
 

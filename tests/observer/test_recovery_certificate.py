@@ -88,7 +88,8 @@ def test_states_that_nothing_shows_are_named():
     """The second state never shows; the first is measured."""
     system = gx.System(lambda x: [0.5 * x[0], 0.9 * x[1]], lambda x: x[:1], G=np.zeros((2, 0)), H=np.zeros((1, 0)))
     noise = gx.Noise(gx.Interval.symmetric([0.1, 0.1]), gx.Interval.symmetric([0.1]))
-    certificate = gx.design_observer(system, noise, gx.Interval.symmetric([2.0, 2.0])).certificate
+    region, fast = gx.Interval.symmetric([2.0, 2.0]), {"sweeps": 1, "window": 1}
+    certificate = gx.design_observer(system, noise, region, **fast).certificate
     np.testing.assert_array_equal(certificate.rows_until_finite(), [0, np.inf])
     np.testing.assert_array_equal(certificate.rows_until_finite(lost=3), [0, 0])  # its box was finite, and stays so
     assert "state 2                0             2         never           inf" in str(certificate)
@@ -96,6 +97,6 @@ def test_states_that_nothing_shows_are_named():
         for call in (certificate.rows_until_finite, certificate.recovered_width):
             with pytest.raises(ValueError, match=rf"{call.__name__}: `lost` must be a number of rows, at least 1"):
                 call(wrong)
-    without = gx.design_observer(system, noise, gx.Interval.symmetric([2.0, 2.0]), missing=False).certificate
+    without = gx.design_observer(system, noise, region, missing=False, **fast).certificate
     with pytest.raises(ValueError, match="must be that of a design with missing=True"):
         without.rows_until_finite()

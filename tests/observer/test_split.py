@@ -119,7 +119,8 @@ def test_widths_settle_where_the_largest_slope_alone_promises_nothing(tmp_path):
     """The slope of x - c x^3 is 1 at 0: no rate below 1 on any region around it, but wide boxes shrink."""
     system = gx.System(lambda x: x - 0.1 * x**3, lambda x: 0 * x, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
     noise = gx.Noise(Interval.symmetric([0.01]), Interval.symmetric([0.1]))
-    plain, cut = (gx.design_observer(system, noise, Interval([-1.0], [1.0]), missing=False, split=s) for s in (1, 16))
+    fast = {"missing": False, "window": 1, "sweeps": 1}
+    plain, cut = (gx.design_observer(system, noise, Interval([-1.0], [1.0]), split=s, **fast) for s in (1, 16))
     assert not plain.certificate.certified
     assert cut.certificate.self_consistent
     for dtype, room in (("float64", 1e-9), ("float32", 1e-4)):
@@ -141,7 +142,8 @@ def test_a_state_without_bounds_has_one_slice():
     )  # fmt: skip
     noise = gx.Noise(Interval.symmetric([0.01, 0.05]), Interval.symmetric([0.1]))
     region = Interval([-np.inf, -1.0], [np.inf, 1.0])
-    plain, cut = (gx.design_observer(system, noise, region, missing=False, split=s).certificate for s in (1, 8))
+    fast = {"missing": False, "window": 1}
+    plain, cut = (gx.design_observer(system, noise, region, split=s, **fast).certificate for s in (1, 8))
     assert (cut.steady_width < 0.999 * plain.steady_width).all()
     np.testing.assert_allclose(cut.next_width(cut.steady_width, noise), cut.steady_width, rtol=1e-6)
     # The slope of x1 on x2 changes its sign: half an interval of the steepest part, twice.
@@ -152,4 +154,5 @@ def test_a_state_without_bounds_has_one_slice():
 def test_an_affine_plant_needs_no_slices():
     system = gx.System(lambda x: 0.9 * x, lambda x: x, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
     noise = gx.Noise(Interval.symmetric([0.01]), Interval.symmetric([0.1]))
-    assert gx.design_observer(system, noise, Interval([-1.0], [1.0]), split="auto").certificate.slices is None
+    observer = gx.design_observer(system, noise, Interval([-1.0], [1.0]), split="auto", missing=False, window=1)
+    assert observer.certificate.slices is None
