@@ -6,6 +6,7 @@ tests/observer/test_uncompiled.py compares both."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -24,9 +25,8 @@ from oracles.uncompiled_calls import in_numpy as in_numpy
 from gsisio_jax.interval.cast import as_array
 from gsisio_jax.observer import estimation
 from gsisio_jax.scalar.numpy_program import numpy_function, numpy_program
-from gsisio_jax.scalar.program import ScalarProgram
 
-MOST_SECONDS = 0.5
+MOST_SECONDS = 3.0
 """Records of a batch that take so long at most are run one by one: to trace a step for many takes longer."""
 
 NAMES = ("_estimate", "_start", "_step", "_resume")
@@ -73,7 +73,6 @@ class _Traced:
         shapes = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
         self.closed, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
         self.structure = jax.tree.structure(shape)
-        self.seconds = _seconds(self.closed.jaxpr)
 
     def mapped(self, axes: Sequence[Sequence[int | None]]) -> Callable[..., Sequence[Any]]:
         """As a function of JAX, under as many `jax.vmap` as there are axes."""
@@ -87,31 +86,26 @@ _numpy = jex.Primitive("in_numpy")
 _numpy.multiple_results = True
 
 
-def _seconds(jaxpr: Any) -> float:
-    """What a run takes, about: an operation on a short array one microsecond, one on a number a thirtieth."""
-    total = 0.0
-    for eqn in jaxpr.eqns:
-        inner = [param.jaxpr for param in eqn.params.values() if hasattr(param, "jaxpr")]
-        if isinstance(program := eqn.params.get("program"), ScalarProgram):
-            total += 3e-8 * len(program.operations)
-        elif inner:
-            total += eqn.params.get("length", 1) * sum(map(_seconds, inner))
-        else:
-            total += 1e-6
-    return total
-
-
 def _values(args: Sequence[Any], program: _Traced, axes: Any) -> Sequence[Any]:
-    count = _size(axes[-1], [arg.shape for arg in args]) if axes else 0
-    if count and count * program.seconds <= MOST_SECONDS:
-        rows = (
-            [arg if axis is None else arg[i] for arg, axis in zip(args, axes[-1], strict=True)] for i in range(count)
-        )
-        return [np.stack(column) for column in zip(*(_values(row, program, axes[:-1]) for row in rows), strict=True)]
+    if axes and (found := _one_by_one(args, program, axes)) is not None:
+        return found
     key = program, axes, tuple(arg.shape for arg in args)
     if key not in _programs:
         _programs[key] = numpy_function(program.mapped(axes), *args) if axes else numpy_program(program.closed)
     return _programs[key](*args)
+
+
+def _one_by_one(args: Sequence[Any], program: _Traced, axes: Any) -> list[Any] | None:
+    """Of a batch; None where the third record shows that all of them would take long."""
+    count = _size(axes[-1], [arg.shape for arg in args])
+    found: list[Sequence[Any]] = []
+    for i in range(count):
+        began = time.perf_counter()
+        row = [arg if axis is None else arg[i] for arg, axis in zip(args, axes[-1], strict=True)]
+        found.append(_values(row, program, axes[:-1]))
+        if i == 2 and (time.perf_counter() - began) * count > MOST_SECONDS:  # before it may be made, or become code
+            return None
+    return [np.stack(column) for column in zip(*found, strict=True)] if found else None
 
 
 def _size(along: Sequence[int | None], shapes: Sequence[tuple[int, ...]]) -> int:
