@@ -116,13 +116,6 @@ class Certificate(eqx.Module):
         )}  # fmt: skip
         return replace(self, **infinite, promised=False, slices=None, notes=(*self.notes, why))
 
-    def without_recovery(self) -> Certificate:
-        """The same without notes and without what it says of lost rows."""
-        return replace(
-            self, recoverable=None, recovery_steps=(), recovery_width=None, lost_row_steps=(), lost_row_width=None,
-            notes=(),
-        )  # fmt: skip
-
     def with_notes(self, *notes: str | None) -> Certificate:
         """The same with more notes; those that are empty are left out."""
         return replace(self, notes=(*self.notes, *filter(None, notes)))

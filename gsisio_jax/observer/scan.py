@@ -58,22 +58,28 @@ def advance(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, h
     return _advance(*fixed(as_it_steps(observer)), carry, y, u, noise, hold)
 
 
-# Inlined, so programs are as if this were a plain function; but what JAX traced of a step once serves every batch, scan
-# and study of that observer.
+# What JAX traced of a step once serves the design, every batch, scan and study of that observer. A program calls it;
+# inlined, each of them would copy its thousands of equations.
 @partial(jax.jit, static_argnames=("static", "hold"))
 def _advance(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
     return _module(observer).advance(observer, carry, y, u, noise, hold)
 
 
+_UNREAD: dict[str, Any] = {
+    "notes": (), "recoverable": None, "recovery_steps": (), "recovery_width": None, "lost_row_steps": (),
+    "lost_row_width": None,
+}  # fmt: skip
+
+
 def as_it_steps(observer: AnyObserver) -> AnyObserver:
-    """The observer without what its certificates say of lost rows, which no step reads: the design has tried a step to
-    find that out, so the first call need not trace it again."""
+    """The observer without what its certificates say of lost rows, which no step reads: a design finds that out by
+    trying steps, and the first call need not trace them again."""
     found = vars(observer).get("_as_it_steps")
     if found is None:
         changed: dict[str, Any] = {}
         if not isinstance(observer, TolerantObserver):
-            changed["certificate"] = observer.certificate.without_recovery()
+            changed["certificate"] = replace(observer.certificate, **_UNREAD)
         if isinstance(observer, DelayedObserver | TolerantObserver):
             changed["inner"] = as_it_steps(observer.inner)
         found = replace(observer, **changed)
