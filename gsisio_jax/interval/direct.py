@@ -56,9 +56,8 @@ def where(mask: Any, a: Any, b: Any) -> Any:
 
 def multiple_and_more(x: Any, factor: Any, least: Any) -> Any:
     """``x * factor + least``, for numbers of NumPy of the type of x."""
-    if isinstance(x, jax.Array) and isinstance(factor, np.generic) and isinstance(least, np.generic):
-        return lax.add(lax.mul(x, factor), least)
-    return x * factor + least
+    quick = isinstance(x, jax.Array) and all(isinstance(number, np.generic) for number in (factor, least))
+    return lax.add(lax.mul(x, factor), least) if quick else x * factor + least
 
 
 def common(values: Sequence[Any]) -> tuple[tuple[int, ...], Any]:
