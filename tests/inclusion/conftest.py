@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from oracles.quick_operators import quick_operators
 from oracles.uncompiled import is_about_xla
 from oracles.uncompiled_bounds import bounds_in_numpy
 
@@ -27,5 +26,5 @@ def in_numpy(request: pytest.FixtureRequest) -> Iterator[None]:
     if is_about_xla(request):
         yield
     else:
-        with bounds_in_numpy(), quick_operators():
+        with bounds_in_numpy():
             yield
