@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -55,15 +54,20 @@ def blank(observer: AnyObserver, initial: Interval) -> Carry:
 
 def advance(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
     """One step of the recursion that belongs to this kind of observer."""
-    return _advance(*fixed(as_it_steps(observer)), carry, y, u, noise, hold)
+    step = _inlined if isinstance(observer, TolerantObserver) else _called
+    return step(*fixed(as_it_steps(observer)), carry, y, u, noise, hold)
 
 
-# What JAX traced of a step once serves the design, every batch, scan and study of that observer. A program calls it;
-# inlined, each of them would copy its thousands of equations.
-@partial(jax.jit, static_argnames=("static", "hold"))
 def _advance(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
     return _module(observer).advance(observer, carry, y, u, noise, hold)
+
+
+# What JAX traced of a step once serves the design, every batch, scan and study of that observer. A program over numbers
+# takes a call of it apart; inlined, its thousands of equations would be copied first. A program over arrays is a tenth
+# faster where it is inlined.
+_called = jax.jit(_advance, static_argnames=("static", "hold"))
+_inlined = jax.jit(_advance, static_argnames=("static", "hold"), inline=True)
 
 
 _UNREAD: dict[str, Any] = {
