@@ -27,7 +27,7 @@ MASKS = {
 
 
 PAIRS = [(a, b) for a, b in itertools.product(OPERANDS, repeat=2) if not {a, b} <= PLAIN]
-SUMS = [(direct.plus, jnp.add), (direct.minus, jnp.subtract), (direct.product, jnp.multiply)]
+SUMS = [(direct.plus, jnp.add), (direct.minus, jnp.subtract)]
 
 
 def agree(found, expected):
@@ -70,7 +70,7 @@ def test_where():
         agree(found, expected)
 
 
-def test_sums_and_products():
+def test_sums():
     for found, expected in traced(added, OPERANDS):
         agree(found, expected)
 
@@ -98,7 +98,7 @@ def test_derivatives():
     x, mask = jnp.array([1.0, -2.0, 3.0]), jnp.array([True, False, True])
 
     def ours(x):
-        return direct.where(mask, direct.product(x, x), direct.minus(direct.plus(x, x), direct.absolute(x))).sum()
+        return direct.where(mask, x * x, direct.minus(direct.plus(x, x), direct.absolute(x))).sum()
 
     found = jax.grad(ours)(x)
     np.testing.assert_array_equal(found, jax.grad(lambda x: jnp.where(mask, x * x, x + x - abs(x)).sum())(x))

@@ -33,11 +33,6 @@ def minus(a: Any, b: Any) -> Any:
     return lax.sub(a, b) if are_alike(a, b) else a - b
 
 
-def product(a: Any, b: Any) -> Any:
-    """``a * b``."""
-    return lax.mul(a, b) if are_alike(a, b) else a * b
-
-
 def absolute(x: Any) -> Any:
     """``abs(x)``."""
     return lax.abs(x) if isinstance(x, jax.Array) else abs(x)

@@ -74,8 +74,10 @@ def source(name: str, params: Any, given: Sequence[Any], found: Sequence[Any]) -
     if name == "integer_pow" and first.kind == "f" and params["y"] in (2, 3):
         return "{0} * {0}" if params["y"] == 2 else "{0} * ({0} * {0})"
     if out.shape or any(kind.shape for kind in given):
-        text = _ARRAYS.get(name) if _spreads(given, out) and (given[0].shape or name != "scale") else None
-        text = _DOUBLE_ARRAYS.get(name, text) if first == np.float64 and _spreads(given, out) else text
+        text = None
+        if _spreads(given, out):
+            text = _ARRAYS.get(name) if given[0].shape or name != "scale" else None
+            text = _DOUBLE_ARRAYS.get(name, text) if first == np.float64 else text
         return text or _as_number(layout_source(name, params, given, out), out)
     if name == "convert_element_type":
         return _converted(first, out.dtype)

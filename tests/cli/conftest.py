@@ -192,7 +192,7 @@ class Project:
 @pytest.fixture(autouse=True)
 def float64_as_before() -> Iterator[None]:
     """The command line turns 64-bit floats on for its own process; here other tests share it."""
-    before = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    before = jax.config.read("jax_enable_x64")
     yield
     jax.config.update("jax_enable_x64", before)
 
@@ -209,7 +209,7 @@ def designed_once() -> Iterator[None]:
         leaves, structure = jax.tree.flatten((system, noise, region, options))
         values = [leaf if isinstance(leaf, str) else (np.asarray(leaf).dtype, np.shape(leaf)) for leaf in leaves]
         numbers = tuple(np.asarray(leaf).tobytes() for leaf in leaves)
-        key = structure, tuple(values), numbers, jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+        key = structure, tuple(values), numbers, jax.config.read("jax_enable_x64")
         if key not in _designs or progress:
             _designs[key] = design(system, noise, region, progress=progress, **options)
         return _designs[key]
