@@ -24,6 +24,7 @@ Source: theory 10.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -90,13 +91,19 @@ def half_sin_cos(r: Any) -> tuple[Any, Any]:
     for the product.
     """
     kind = np.dtype(r.dtype).type
-    quarter = jax.lax.stop_gradient(r) * kind(0.25)
-    sine, cosine = (_polynomials_traced if isinstance(r, Tracer) else _polynomials)(quarter)
+    sine, cosine = _polynomials(jax.lax.stop_gradient(r) * kind(0.25))
     sine, cosine = 2 * sine * cosine, 1 - 2 * sine * sine
     half = r * kind(0.5)
     return _wave(sine, half, cosine), _falling(cosine, half, sine)
 
 
+def _traced_once(function: Callable[..., Any]) -> Callable[..., Any]:
+    """What was traced for a type and shape serves all sines; numbers that are known are computed as they are."""
+    inlined = jax.jit(function, inline=True)
+    return lambda t: (inlined if isinstance(t, Tracer) else function)(t)
+
+
+@_traced_once
 def _polynomials(y: Any) -> tuple[Any, Any]:
     """Sine and cosine for ``|y| <= pi/4 + 2^-20``."""
     kind = np.dtype(y.dtype).type
@@ -107,18 +114,12 @@ def _polynomials(y: Any) -> tuple[Any, Any]:
     return y + y * (z * p), 1 + z * (kind(-0.5) + z * q)
 
 
-_polynomials_traced = jax.jit(_polynomials, inline=True)
-
-
 def _name(t: Any) -> str:
     return "float32" if t.dtype == jnp.float32 else "float64"
 
 
+@_traced_once
 def _sin_cos(t: Any) -> tuple[Any, Any]:
-    return _sin_cos_traced(t) if isinstance(t, Tracer) else _sin_cos_of(t)
-
-
-def _sin_cos_of(t: Any) -> tuple[Any, Any]:
     kind = np.dtype(t.dtype).type
     k = jnp.round(t * kind(2 / math.pi))
     y = t
@@ -133,7 +134,3 @@ def _sin_cos_of(t: Any) -> tuple[Any, Any]:
     sine = where(quarter >= 0.5, -first, first)
     cosine = where((quarter == 0.25) | (quarter == 0.5), -second, second)
     return fusion_barrier(sine), fusion_barrier(cosine)
-
-
-_sin_cos_traced = jax.jit(_sin_cos_of, inline=True)
-"""What was traced for a type and shape serves all sines."""
