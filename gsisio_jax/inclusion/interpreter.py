@@ -59,8 +59,8 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
     known, needed = patterns.find(jaxpr), None
     bent = one_variable.find(jaxpr, values)
     if bent:
+        needed = one_variable.needed(jaxpr, bent, known)
         known = known | bent
-        needed = one_variable.needed(jaxpr, known)
     for place, eqn in enumerate(jaxpr.eqns):
         if needed is not None and place not in needed:
             continue

@@ -157,14 +157,15 @@ def _nearly(node: Node, factor: Fraction) -> Node:
     return Node(wider(node.range), form, None if node.jac is None else wider(node.jac))
 
 
-def needed(jaxpr: Any, known: dict[int, Match]) -> set[int]:
-    """Places of the equations that the results come from, where some are known as a whole."""
+def needed(jaxpr: Any, bent: dict[int, Match], known: dict[int, Match]) -> set[int]:
+    """Places of the equations that the results come from, where some bend as a whole. Of an expression that is `known`
+    as a whole the last equation still counts: its rule may not apply to what it is given."""
     wanted, places = {v for v in jaxpr.outvars if isinstance(v, jex.Var)}, set[int]()
     for place in range(len(jaxpr.eqns) - 1, -1, -1):
         eqn = jaxpr.eqns[place]
         if eqn.effects or any(v in wanted for v in eqn.outvars):
             places.add(place)
-            match = known.get(place)
-            operands = eqn.invars if match is None else match.operands
+            match = bent.get(place) or known.get(place)
+            operands = [*(() if place in bent else eqn.invars), *(() if match is None else match.operands)]
             wanted |= {v for v in operands if isinstance(v, jex.Var)}
     return places

@@ -151,6 +151,7 @@ def test_smooth_functions(program, sides):
 @settings(max_examples=20, deadline=None)
 @given(programs(SMOOTH | KINKED | JUMPING), boxes)
 @example([("abs", "add"), ("clip", None)], [(-0.5, 1.0)] * 3)  # hinges that end in a call
+@example([("clip", "max"), ("norm", None)], [(0.0, 1.0)] * 3)  # hinges under a known expression
 def test_functions_with_kinks_and_jumps(program, sides):
     f, box = build(*zip(*program, strict=True)), to_box(sides)
     x = points(box.lower, box.upper)
