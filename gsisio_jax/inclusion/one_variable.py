@@ -166,6 +166,7 @@ def needed(jaxpr: Any, bent: dict[int, Match], known: dict[int, Match]) -> set[i
         if eqn.effects or any(v in wanted for v in eqn.outvars):
             places.add(place)
             match = bent.get(place) or known.get(place)
-            operands = [*(() if place in bent else eqn.invars), *(() if match is None else match.operands)]
-            wanted |= {v for v in operands if isinstance(v, jex.Var)}
+            operands = () if match is None else match.operands
+            read = operands if place in bent else (*eqn.invars, *operands)
+            wanted |= {v for v in read if isinstance(v, jex.Var)}
     return places
