@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from gsisio_jax._calls import named_arguments
+from gsisio_jax._room import with_room
 from gsisio_jax.continuous import maps, sides
 from gsisio_jax.continuous.arguments import Arguments, cells_of, check_bounded, read
 from gsisio_jax.continuous.bound import StepError
@@ -22,6 +23,7 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.plant.calls import check_map, takes_u
 
 
+@with_room
 @named_arguments
 def discretize(
     f: Callable[..., Any],

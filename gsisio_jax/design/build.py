@@ -7,6 +7,7 @@ from typing import Any, Literal, overload
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax._collector import rare_collection
+from gsisio_jax._room import with_room
 from gsisio_jax.design.arguments import check_cells, checked
 from gsisio_jax.design.current import Dials, design_current
 from gsisio_jax.design.delay import check_delay, design_delayed
@@ -107,6 +108,7 @@ def design_observer(
 ) -> PredictionObserver: ...
 
 
+@with_room
 @named_arguments
 def design_observer(
     system: System,

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from gsisio_jax._calls import named_arguments
+from gsisio_jax._room import with_room
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type, is_whole, read_array
 from gsisio_jax.plant.periodic import wrapped_outputs
@@ -26,6 +27,7 @@ class Simulation(NamedTuple):
     v: Float[Array, "steps l"]
 
 
+@with_room
 @named_arguments
 def simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any = None) -> Simulation:
     """Simulate the plant with noise drawn uniformly from its bounds.

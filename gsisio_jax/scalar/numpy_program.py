@@ -13,6 +13,7 @@ import jax.extend.core as jex
 import numpy as np
 
 from gsisio_jax._collector import rare_collection
+from gsisio_jax._room import with_room
 from gsisio_jax.scalar.numpy_numbers import SAME, add_numbers, has_numbers_of_numpy
 from gsisio_jax.scalar.numpy_operations import numpy_operation, plain
 from gsisio_jax.scalar.numpy_source import Operation, as_code
@@ -30,6 +31,7 @@ _FEW_RUNS = 6  # a program that runs oftener becomes Python's code, which takes 
 _MAYBE_SAME = {"reshape", "squeeze", "expand_dims", "broadcast_in_dim", "convert_element_type"}
 
 
+@with_room
 @rare_collection()
 def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[..., Any]:
     """`function` of pytrees of arrays, traced once for the shapes and types of `example`.
@@ -42,6 +44,7 @@ def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[...,
     return lambda *args: jax.tree.unflatten(structure, program(*jax.tree.leaves(args)))
 
 
+@with_room
 @rare_collection()
 def numpy_program(closed: Any) -> Callable[..., list[Any]]:
     """The program of a jaxpr: its arguments to its results, arrays all."""

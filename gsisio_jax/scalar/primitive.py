@@ -18,6 +18,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
 
 from gsisio_jax._collector import rare_collection
+from gsisio_jax._room import with_room
 from gsisio_jax.scalar.derivative import Mask, cotangent_program, reached, tangent_program
 from gsisio_jax.scalar.program import ScalarProgram
 
@@ -81,6 +82,7 @@ def _types(args: Sequence[Any], program: ScalarProgram, levels: Levels) -> list[
     return types
 
 
+@with_room
 @rare_collection()
 def _lowered(*args: Any, program: ScalarProgram, levels: Levels) -> Any:
     return _function(program, levels)(*args)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from gsisio_jax._collector import rare_collection
+from gsisio_jax._room import with_room
 from gsisio_jax.scalar.options import loops_are_functions
 from gsisio_jax.scalar.primitive import run
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
@@ -125,6 +126,7 @@ def call(function: Callable[..., Any], *args: Any) -> Any:
     return jax.tree.unflatten(structure, _packed(run(program, [*consts, *numbers]), program.results, ()))
 
 
+@with_room
 @rare_collection()
 def _trace(
     function: Callable[..., Any], *args: Any, most: int | None = None

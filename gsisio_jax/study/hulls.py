@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from gsisio_jax._calls import named_arguments
+from gsisio_jax._room import with_room
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.checks import AnyObserver, prepare, refuse_input_model
 from gsisio_jax.observer.delayed import DelayedObserver
@@ -24,6 +25,7 @@ from gsisio_jax.study.tightness_result import Tightness
 STEPS = 10
 
 
+@with_room
 @named_arguments
 def tightness(
     observer: AnyObserver,

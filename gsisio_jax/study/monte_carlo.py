@@ -11,6 +11,7 @@ import numpy as np
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
+from gsisio_jax._room import with_room
 from gsisio_jax.errors import ContainmentLost
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import read_array
@@ -42,6 +43,7 @@ RANKS = {
 Draw = Literal["uniform", "vertices"] | Callable[..., Any]
 
 
+@with_room
 @named_arguments
 def monte_carlo(
     observer: AnyObserver,

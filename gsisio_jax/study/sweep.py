@@ -7,6 +7,7 @@ from typing import Any
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
+from gsisio_jax._room import with_room
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer import checks
@@ -25,6 +26,7 @@ from gsisio_jax.study.run import run
 CALL = "sweep"
 
 
+@with_room
 @named_arguments
 def sweep(
     observer: AnyObserver,

@@ -17,6 +17,7 @@ import numpy as np
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
+from gsisio_jax._room import with_room
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.build import design_observer
 from gsisio_jax.design.existence import check_existence, check_rank
@@ -71,6 +72,7 @@ class Allocation:
         )
 
 
+@with_room
 @named_arguments
 def allocate(
     system: System,

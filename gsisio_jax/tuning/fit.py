@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gsisio_jax._calls import named_arguments
+from gsisio_jax._room import with_room
 from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.observer.types import Observer
 from gsisio_jax.plant.system import Noise
@@ -20,6 +21,7 @@ from gsisio_jax.tuning.search import Progress, Search
 from gsisio_jax.tuning.shape import Parameters, Shape, read_shape
 
 
+@with_room
 @named_arguments
 def tune_noise(
     observer: Observer,

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
+from gsisio_jax._room import with_room
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import checks
 from gsisio_jax.observer.types import Observer
@@ -23,6 +24,7 @@ from gsisio_jax.tuning.model import with_model
 KINDS = ("final", "steady", "certificate")
 
 
+@with_room
 @named_arguments
 def width_sensitivity(
     observer: Observer,
