@@ -49,7 +49,9 @@ def test_it_is_the_same_function():
         divided(1.0, by=0.0)
 
 
-@pytest.mark.parametrize("call", [gx.design_observer, gx.estimate, gx.simulate, gx.sweep, gx.monte_carlo], ids=repr)
+@pytest.mark.parametrize(
+    "call", [gx.design_observer, gx.estimate, gx.simulate, gx.sweep, gx.monte_carlo], ids=lambda f: f.__name__
+)
 def test_misspelled_arguments_are_named_as_elsewhere(call):
     with pytest.raises(TypeError, match="there is no argument `obsrever`"):
         call(obsrever=1)

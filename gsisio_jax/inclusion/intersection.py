@@ -21,6 +21,9 @@ from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.rounding import Rounding, lowered, raised, rounded_by, unbounded, up
 
 METHODS = ("affine", "natural", "decomposition", "remainder", "mean_value", "abstraction")
+"""Names of the ways to bound a function that `bound` and `design_observer(bounds=...)` take, any number of them: those
+of the functions `affine`, `natural`, `decomposition`, `remainder` and `mean_value`, and the planes of `Abstraction`."""
+
 DEFAULT = ("affine", "natural")
 
 

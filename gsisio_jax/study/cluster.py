@@ -162,7 +162,7 @@ def _ended(client: Any, call: str, running: Iterable[Any]) -> list[Any]:
         if client.nthreads():
             since = time.monotonic()
         elif not told and time.monotonic() - since > ALONE:
-            warnings.warn(f"{call}: the cluster has no workers; waiting for some", RuntimeWarning, stacklevel=6)
+            warnings.warn(f"{call}: the cluster has no workers; waiting for some", RuntimeWarning, stacklevel=7)
             told = True
     return ended
 

@@ -21,7 +21,6 @@ from gsisio_jax.study.truth import Coverage
 SLACK = {True: 1e-9, False: 1e-3}
 
 
-# How a simulated run may leave what the boxes rely on: bits of the variable ``broken``.
 BROKEN = (
     "the first state lies outside of the initial box",
     "the state left `state_bounds` of the system",
@@ -29,6 +28,8 @@ BROKEN = (
     "`draw` returned noise outside of its bounds",
     "the simulated state or measurement is not finite",
 )
+"""How a simulated run may leave what the boxes rely on, one sentence for every bit (the lowest first) of the variable
+``broken`` of `monte_carlo`."""
 
 
 @dataclass(frozen=True)

@@ -258,6 +258,8 @@ REDUCTIONS: dict[str, Reduction] = {
         Final(), Max(), Mean(), Rms(), Settle(), FirstConflict(), AnyStatus(), Coverage(), Error(), Boxes(),
     )
 }  # fmt: skip
+"""Every reduction that `sweep` and `monte_carlo` know by name: what is kept of a run. More are made by `quantiles` and
+`settle`, or are subclasses of `Reduction`."""
 
 
 def resolve(call: str, reduce: Any, truth: bool) -> tuple[Reduction, ...]:

@@ -12,6 +12,8 @@ from gsisio_jax._extras import need
 # What is told elsewhere, or has no sense as a mean.
 PLAIN = ("coverage", "miss", "broken_at")
 STATISTICS = ("mean", "mean_lower", "mean_upper", "std", "min", "median", "max", "share")
+"""Names along the dimension ``statistic`` of what `summary` adds. ``mean_lower`` and ``mean_upper`` are Student's
+interval of the mean, ``share`` is that of the runs that have a number at all, over which the others are taken."""
 
 
 @named_arguments
