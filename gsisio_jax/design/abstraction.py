@@ -18,7 +18,7 @@ import numpy as np
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.design.abstraction_program import gap, planes_at_vertices
 from gsisio_jax.design.abstraction_proof import prove
-from gsisio_jax.design.abstraction_sigma import amount, refusal, sigma_of, values_at
+from gsisio_jax.design.abstraction_sigma import amount, refusal, sigma_of, values_at, with_hash
 from gsisio_jax.inclusion import UnknownPrimitiveError
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval
@@ -75,6 +75,7 @@ def affine_abstraction(
     if slopes not in ("free", "zero"):
         raise refusal(f'`slopes` must be "free" or "zero", got {slopes!r}')
     lower, upper, single = _cells(region, mesh)
+    f = with_hash(f)
     with jax.enable_x64(True):
         signs = np.array(list(itertools.product([-1.0, 1.0], repeat=lower.shape[1])))
         corners = np.where(signs > 0, upper[:, None, :], lower[:, None, :])

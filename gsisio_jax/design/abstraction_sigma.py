@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion import affine, jacobian
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 _BATCH = 1024  # boxes per call of a compiled function
 _REMEDIES = 'give `constant`, or take another class: "Lipschitz" where f has kinks, "C0" with the modulus of continuity'
@@ -40,23 +41,33 @@ _QUESTIONS: dict[str, Callable[[Any, Interval], Any]] = {
     "first": lambda f, box: (jacobian(f)(box), None),
     "second": lambda f, box: (jacobian(f)(box), jacobian(jax.jacfwd(f))(box)),
 }
-# jit keeps what is compiled for as long as f lives: a second mesh costs no second compilation. That is what takes
-# the time here, so it is done without optimisation.
-_filter_jit: Any = eqx.filter_jit
 
 
-@_filter_jit(compiler_options={"xla_backend_optimization_level": 0})
-def _compiled(question: str, f: Any, lower: Any, upper: Any) -> Any:
-    return jax.vmap(lambda a, b: _QUESTIONS[question](f, Interval.unchecked(a, b)))(lower, upper)
-
-
-def on_boxes(question: str, f: Any, lower: np.ndarray, upper: np.ndarray, size: int = _BATCH) -> Any:
+def on_boxes(question: str, f: Any, lower: np.ndarray, upper: np.ndarray) -> Any:
     """Results on all boxes (boxes, n), as NumPy arrays; in batches of one size, the last one filled up."""
+    program = _program(question, f, lower.shape[1])
     parts = []
-    for start in range(0, len(lower), size):
-        index = np.minimum(np.arange(start, start + size), len(lower) - 1)
-        parts.append(_compiled(question, f, lower[index], upper[index]))
+    for start in range(0, len(lower), _BATCH):
+        index = np.minimum(np.arange(start, start + _BATCH), len(lower) - 1)
+        parts.append(program(lower[index], upper[index]))
     return jax.tree.map(lambda *rows: np.concatenate(rows)[: len(lower)], parts[0], *parts[1:])
+
+
+# Kept for the next boxes, and for a second mesh.
+@lru_cache(16)
+def _program(question: str, f: Any, n: int) -> Callable[..., Any]:
+    """In NumPy: XLA would take ten times as long to compile second derivatives as all boxes take here."""
+    ask, batch = _QUESTIONS[question], np.zeros((_BATCH, n))
+    return numpy_function(jax.vmap(lambda a, b: ask(f, Interval.unchecked(a, b))), batch, batch)
+
+
+def with_hash(f: Any) -> Any:
+    """The function itself if it has a hash, by which programs are kept; else a new one that does the same."""
+    try:
+        hash(f)
+    except TypeError:
+        return lambda x: f(x)
+    return f
 
 
 def values_at(f: Any, corners: np.ndarray) -> np.ndarray:
@@ -108,7 +119,7 @@ def _enclosed_derivatives(f: Any, lower: np.ndarray, upper: np.ndarray, second: 
     if obstacle is not None:
         raise refusal(f"f uses {obstacle}, so JAX's second derivative may not be the true one; {_REMEDIES}")
     try:
-        return on_boxes("second" if second else "first", f, lower, upper, size=64)
+        return on_boxes("second" if second else "first", f, lower, upper)
     except (TypeError, ValueError, NotImplementedError) as error:
         raise refusal(f"the derivatives of f cannot be enclosed ({error}); {_REMEDIES}") from error
 

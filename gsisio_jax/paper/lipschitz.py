@@ -23,6 +23,7 @@ from gsisio_jax.inclusion.mixed_monotone import decomposition_gain, width_gain
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.plant.system import System
+from gsisio_jax.scalar.numpy_program import numpy_function
 
 _BATCH = 64  # boxes per call of the engine: one shape, one compilation
 _ROUNDS = 400
@@ -138,7 +139,7 @@ def lipschitz_constants(
     if derivative is None:
         maps = (system.dynamics, system.measurement)
         with jax.enable_x64(True):
-            enclose = _compiled(maps, u_region)
+            enclose = _stacked(maps, u_region, system.n)
             pairs = [_largest_norm(lambda boxes, i=i: enclose(boxes)[i], region, tolerance) for i in range(2)]
             (upper_f, lower_f, df), (upper_g, lower_g, dg) = pairs
     else:
@@ -208,7 +209,7 @@ def norm_bound(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     return np.where(finite, bound * (1 + _ROUNDING), np.inf)
 
 
-def _compiled(maps: tuple[Callable[..., Any], ...], u_region: Interval) -> Callable[[Any], list[Any]]:
+def _stacked(maps: tuple[Callable[..., Any], ...], u_region: Interval, n: int) -> Callable[[Any], list[Any]]:
     """Jacobian enclosures of all maps on a stack (k, 2, n) of at most `_BATCH` boxes, each as an array (k, 2, m, n)."""
     u_box = u_region.astype(np.float64)
 
@@ -216,11 +217,11 @@ def _compiled(maps: tuple[Callable[..., Any], ...], u_region: Interval) -> Calla
         found = [inclusion.jacobian(q)(Interval.unchecked(sides[0], sides[1]), u_box) for q in maps]
         return [jnp.stack([jac.lower, jac.upper]) for jac in found]
 
-    stacked = jax.jit(jax.vmap(at))
+    program = numpy_function(jax.vmap(at), np.zeros((_BATCH, 2, n)))
 
     def call(sides: np.ndarray) -> list[Any]:
         full = np.concatenate([sides, np.broadcast_to(sides[:1], (_BATCH - len(sides), *sides.shape[1:]))])
-        return [np.asarray(found)[: len(sides)] for found in stacked(full)]
+        return [found[: len(sides)] for found in program(full)]
 
     return call
 
