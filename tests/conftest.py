@@ -58,7 +58,7 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
             terminalreporter.line(f"{spent:7.1f} s  {name}")
 
 
-_MOST_SECONDS = 15.0  # of tests between two clearings, which take a third of a second each
+_MOST_SECONDS = 30.0  # of tests between two clearings, which take a third of a second each
 _cleared = [time.process_time()]
 
 

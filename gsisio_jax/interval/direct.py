@@ -7,6 +7,7 @@ changes nothing; all else goes the usual way.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -45,7 +46,7 @@ def where(mask: Any, a: Any, b: Any) -> Any:
     if not agree or not any(isinstance(value, jax.Array) for value in (mask, a, b)):
         return jnp.where(mask, a, b)
     dtype = jax.dtypes.canonicalize_dtype(types[0])
-    shape = np.broadcast_shapes(*map(np.shape, (mask, a, b)))
+    shape = common_shape(mask, a, b)
     return lax.select(alike(mask, shape, np.dtype(bool)), alike(a, shape, dtype), alike(b, shape, dtype))
 
 
@@ -55,18 +56,31 @@ def multiple_and_more(x: Any, factor: Any, least: Any) -> Any:
     return lax.add(lax.mul(x, factor), least) if quick else x * factor + least
 
 
+def entries(x: Any) -> list[Any]:
+    """``list(x)``."""
+    return [lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0])] if isinstance(x, jax.Array) else list(x)
+
+
+def common_shape(*values: Any) -> tuple[int, ...]:
+    """`numpy.broadcast_shapes` of these, which mostly have one shape."""
+    shapes = {np.shape(value) for value in values}
+    return shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
+
+
 def common(values: Sequence[Any]) -> tuple[tuple[int, ...], Any]:
     """Shape and type that operands are brought to."""
     types = {getattr(value, "dtype", None) for value in values}
     alone = len(types) == 1 and None not in types and isinstance(values[0], jax.Array)
-    return np.broadcast_shapes(*map(np.shape, values)), types.pop() if alone else jnp.result_type(*values)
+    return common_shape(*values), types.pop() if alone else jnp.result_type(*values)
 
 
 def alike(value: Any, shape: tuple[int, ...], dtype: Any) -> Any:
     """An operand in that shape and type; a constant of few entries stays an array of NumPy."""
     if not isinstance(value, jax.Array):
         value = np.asarray(value, dtype)
-        few = np.prod(shape, dtype=int) <= _FEW
+        if value.shape == shape:
+            return value
+        few = math.prod(shape) <= _FEW
         return np.broadcast_to(value, shape) if few else jnp.broadcast_to(value, shape)
     if value.dtype != dtype:
         value = lax.convert_element_type(value, dtype)

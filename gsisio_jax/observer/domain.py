@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.interval.direct import where
+from gsisio_jax.interval.direct import entries, where
 from gsisio_jax.interval.minmax import cut, raised, smaller
 from gsisio_jax.observer.status import SOURCE_STRIDE, Source
 
@@ -50,11 +52,11 @@ class Domain(eqx.Module):
         if not slack.shape[0]:
             return self
         first = int(kind) * SOURCE_STRIDE
-        best, code, gap = cut(jnp.asarray(jnp.inf, self.box.dtype), slack[0]), jnp.int32(first), cut(self.gap, slack[0])
-        for i in range(1, slack.shape[0]):
-            # No argmin and no gather: both are slow in batches.
-            code = where(slack[i] < best, jnp.int32(first + i), code)
-            best, gap = cut(best, slack[i]), cut(gap, slack[i])
+        best, code, gap = np.asarray(np.inf, self.box.dtype), np.int32(first), self.gap
+        # No argmin and no gather: both are slow in batches.
+        for i, entry in enumerate(entries(slack)):
+            code = where(entry < best, np.int32(first + i), code) if i else code
+            best, gap = cut(best, entry), cut(gap, entry)
         return self._noted(best, code, gap)
 
     def taken(self, other: Domain) -> Domain:
@@ -96,9 +98,7 @@ class Domain(eqx.Module):
         met = Interval.unchecked(where(empty, box.lower, lower), where(empty, box.upper, upper))
         # Boxes may also miss each other where each of them meets this one.
         noted = self.record_margin(cut(room, where(empty, width, jnp.inf)), kind)
-        gap = self.gap
-        for i in range(width.shape[0]):
-            gap = cut(gap, width[i])
+        gap = reduce(cut, entries(width), self.gap)
         return Domain(met, self.tolerance, gap, noted.margin, noted.source)
 
     @property
@@ -116,10 +116,7 @@ class Domain(eqx.Module):
 
 def _meeting(boxes: Interval) -> tuple[Any, Any]:
     """Largest lower and smallest upper bound of a stack of boxes."""
-    low, high = boxes.lower[0], boxes.upper[0]
-    for k in range(1, boxes.lower.shape[0]):
-        low, high = raised(low, boxes.lower[k]), cut(high, boxes.upper[k])
-    return low, high
+    return reduce(raised, entries(boxes.lower)), reduce(cut, entries(boxes.upper))
 
 
 def largest_magnitude(*values: Any) -> Any:

@@ -60,7 +60,7 @@ class Graph:
     def make(self, name: str, operands: tuple[Any, ...], dtype: Any, equation: Any = None, key: Any = None) -> Number:
         """The number as it stands, without simplification."""
         names = tuple(id(v) if isinstance(v, Number) else (v.dtype.char, v.tobytes()) for v in operands)
-        identity = name, names, key, str(dtype)
+        identity = name, names, key, dtype
         found = self._found.get(identity)
         if found is None:
             sign = _NONNEGATIVE.get(name)

@@ -75,8 +75,11 @@ def evaluate(graph: Graph, jaxpr: Any, consts: Sequence[Any], args: Sequence[Any
         aval: Any = atom.aval
         return constants(np.asarray(atom.val, aval.dtype))
 
+    names, stage = None, scope
     for eqn in jaxpr.eqns:
-        stage = f"{scope}/{eqn.source_info.name_stack}".strip("/")
+        if eqn.source_info.name_stack is not names:
+            names = eqn.source_info.name_stack
+            stage = f"{scope}/{names}".strip("/")
         values.update(zip(eqn.outvars, applied(graph, eqn, [read(atom) for atom in eqn.invars], stage), strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
