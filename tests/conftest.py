@@ -26,7 +26,7 @@ LONGEST = ("test_gallery.py", "test_recovery.py", "test_documents.py", "test_unc
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtestloop(session: pytest.Session) -> Any:
-    """All tests once more from here, where deep calls find room: a fifth of the suite's time (`gsisio_jax._room`)."""
+    """All tests once more from here, where deep calls find room: an eighth of the suite's time (`gsisio_jax._room`)."""
     if session.stash.get(_HAS_ROOM, False):
         return None
     session.stash[_HAS_ROOM] = True
