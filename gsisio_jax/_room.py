@@ -24,10 +24,9 @@ def with_room(function: Call) -> Call:
     if sys.version_info >= (3, 15):
         return function
 
-    @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> Any:
         __tracebackhide__ = True
         return function(*arguments, **named)
 
     call.__code__ = call.__code__.replace(co_stacksize=_WORDS)
-    return call  # type: ignore[return-value]
+    return functools.wraps(function)(call)  # type: ignore[return-value]
