@@ -13,6 +13,7 @@ import numpy as np
 
 from gsisio_jax.inclusion import affine, jacobian
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.rounding import outward
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 _BATCH = 1024  # boxes per call of a compiled function
@@ -45,7 +46,7 @@ _QUESTIONS: dict[str, Callable[[Any, Interval], Any]] = {
 
 def on_boxes(question: str, f: Any, lower: np.ndarray, upper: np.ndarray) -> Any:
     """Results on all boxes (boxes, n), as NumPy arrays; in batches of one size, the last one filled up."""
-    program = _program(question, f, lower.shape[1])
+    program = _program(question, f, lower.shape[1], outward())
     parts = []
     for start in range(0, len(lower), _BATCH):
         index = np.minimum(np.arange(start, start + _BATCH), len(lower) - 1)
@@ -53,9 +54,9 @@ def on_boxes(question: str, f: Any, lower: np.ndarray, upper: np.ndarray) -> Any
     return jax.tree.map(lambda *rows: np.concatenate(rows)[: len(lower)], parts[0], *parts[1:])
 
 
-# Kept for the next boxes, and for a second mesh.
+# Kept for the next boxes, and for a second mesh; it rounds as it did when it was traced.
 @lru_cache(16)
-def _program(question: str, f: Any, n: int) -> Callable[..., Any]:
+def _program(question: str, f: Any, n: int, rounds_outward: bool) -> Callable[..., Any]:
     """In NumPy: XLA would take ten times as long to compile second derivatives as all boxes take here."""
     ask, batch = _QUESTIONS[question], np.zeros((_BATCH, n))
     return numpy_function(jax.vmap(lambda a, b: ask(f, Interval.unchecked(a, b))), batch, batch)

@@ -14,8 +14,9 @@ from oracles.inclusion_points import points
 from scipy import optimize
 
 from gsisio_jax.design.abstraction import affine_abstraction
+from gsisio_jax.design.abstraction_sigma import on_boxes
 from gsisio_jax.examples.paper import output_map, state_map
-from gsisio_jax.interval import Interval
+from gsisio_jax.interval import Interval, rounding
 
 # Name in the oracle: the same function in JAX, and where its argument starts (it is 1 wide).
 SINGLE = {
@@ -376,3 +377,17 @@ def test_a_box_of_another_shape():
     planes = affine_abstraction(square, Interval([0.0], [1.0]))
     with pytest.raises(ValueError, match=r"Abstraction.over: an Interval of shape \(1,\)"):
         planes.over(Interval([0.0, 0.0], [1.0, 1.0]))
+
+
+def test_programs_that_round_to_nearest_are_not_kept_for_those_that_round_outward():
+    """Planes of a function are certain again after somebody asked for bounds without rounding."""
+    low, high = np.array([[0.1, -0.7]]), np.array([[0.3, 1.1]])
+
+    def f(x):
+        return jnp.stack([0.3 * x[0] * x[1], jnp.sin(x[0]) - x[1] / 49])
+
+    with rounding.using("nearest"):
+        plain, _ = on_boxes("bounds", f, low, high)
+    certain, _ = on_boxes("bounds", f, low, high)
+    assert (certain.range.lower < plain.range.lower).all()
+    assert (certain.range.upper > plain.range.upper).all()
