@@ -68,8 +68,11 @@ def contract_affine_rows(states: States, form: Affine, z: Interval) -> tuple[Int
     usable = size > _SMALLEST_SLOPE * largest
     inverse = 1 / where(usable, slope, 1)
     up = slope > 0
-    a, b = where(up, own_low, own_high) * inverse, where(up, own_high, own_low) * inverse
-    return Interval.unchecked(where(usable, a, -jnp.inf), where(usable, b, jnp.inf)), slack
+    a, b = where(up, own_low, own_high), where(up, own_high, own_low)
+    # Infinite sides are left out of the product: its derivative would be 0 times infinity.
+    of_a, of_b = usable & jnp.isfinite(a), usable & jnp.isfinite(b)
+    a, b = where(of_a, a, 0) * inverse, where(of_b, b, 0) * inverse
+    return Interval.unchecked(where(of_a, a, -jnp.inf), where(of_b, b, jnp.inf)), slack
 
 
 class Newton(NamedTuple):

@@ -59,6 +59,11 @@ def test_finite_everywhere(tank):
     assert tank.not_finite() == []
 
 
+def test_finite_everywhere_where_rows_are_solved_on_infinite_boxes():
+    """The second sweep of the paper's example solves its outputs for states of which nothing is known."""
+    assert Checker(systems.s1(), 24, folded, in_numpy, sweeps=2).not_finite() == []
+
+
 BOX = gx.Interval([-1.0], [1.0])
 
 
