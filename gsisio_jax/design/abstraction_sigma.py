@@ -16,7 +16,7 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.rounding import outward
 from gsisio_jax.scalar.numpy_program import numpy_function
 
-_BATCH = 1024  # boxes per call of a compiled function
+_BATCH = 1024  # boxes per call of a program
 _REMEDIES = 'give `constant`, or take another class: "Lipschitz" where f has kinks, "C0" with the modulus of continuity'
 
 
@@ -63,7 +63,8 @@ def _program(question: str, f: Any, n: int, rounds_outward: bool) -> Callable[..
 
 
 def with_hash(f: Any) -> Any:
-    """The function itself if it has a hash, by which programs are kept; else a new one that does the same."""
+    """The function itself if it has a hash, by which programs are kept; else a new one that does the same, so that
+    nothing is kept for the next call: what has no hash may have changed by then (unlike the maps of `as_static`)."""
     try:
         hash(f)
     except TypeError:

@@ -56,9 +56,11 @@ def multiple_and_more(x: Any, factor: Any, least: Any) -> Any:
     return lax.add(lax.mul(x, factor), least) if quick else x * factor + least
 
 
-def entries(x: Any) -> list[Any]:
-    """``list(x)``."""
-    return [lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0])] if isinstance(x, jax.Array) else list(x)
+def entries(x: Any, axis: int = 0) -> list[Any]:
+    """What lies along an axis, ``list(x)`` for the first."""
+    if not isinstance(x, jax.Array):
+        return list(np.moveaxis(x, axis, 0))
+    return [lax.index_in_dim(x, i, axis, keepdims=False) for i in range(x.shape[axis])]
 
 
 def common_shape(*values: Any) -> tuple[int, ...]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import ad, batching, mlir
 
-from gsisio_jax.interval.direct import alike, common, plus
+from gsisio_jax.interval.direct import alike, common, entries, plus
 
 
 def elementwise(name: str, body: Callable[..., Any], derivative: Callable[..., Any]) -> Callable[..., Any]:
@@ -132,8 +132,7 @@ def add_up(values: Any, axis: int = -1) -> Any:
     count = values.shape[axis]
     if isinstance(values, np.ndarray) or not 0 < count <= _SHORT:
         return values.sum(axis)
-    entries = [jax.lax.index_in_dim(values, i, axis, keepdims=False) for i in range(count)]
-    return reduce(plus, entries)
+    return reduce(plus, entries(values, axis))
 
 
 def multiplied(a: Any, b: Any) -> Any:

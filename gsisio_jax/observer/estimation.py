@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax._calls import named_arguments
-from gsisio_jax._room import with_room
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import check_type
 from gsisio_jax.interval.rounding import Rounding
@@ -104,7 +103,6 @@ class Estimate(eqx.Module):
         return self.to_xarray(**labels).to_dataframe()
 
 
-@with_room
 @named_arguments
 def estimate(
     observer: AnyObserver,

@@ -25,7 +25,7 @@ from gsisio_jax.interval.reading import check_type
 from gsisio_jax.plant.system import System
 from gsisio_jax.scalar.numpy_program import numpy_function
 
-_BATCH = 64  # boxes per call of the engine: one shape, one compilation
+_BATCH = 64  # boxes per call of the engine: one shape, one trace
 _ROUNDS = 400
 _ROUNDING = 1e-14  # relative error allowed to a computed norm
 _VERTICES = 6  # up to 2^6 vertices of an interval matrix are tried; beyond that center plus radius
