@@ -14,8 +14,9 @@ from oracles.uncompiled import uncompiled as without_xla
 from gsisio_jax._room import with_room
 
 jax.config.update("jax_enable_x64", True)
-# Tracing makes millions of small objects that live on: looking for garbage as often as usual is a tenth of the time.
-gc.set_threshold(100_000, 20, 50)
+# Tracing makes millions of small objects that live on: looking for garbage among them, even as rarely as designs do,
+# is a twelfth of the time. It is looked for below.
+gc.disable()
 
 
 # A file stays on one worker. These take longest; begun last (they have few tests), they would leave a core idle.
@@ -58,13 +59,13 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
             terminalreporter.line(f"{spent:7.1f} s  {name}")
 
 
-_MOST_SECONDS = 30.0  # of tests between two clearings, which take a third of a second each
+_MOST_SECONDS = 90.0  # of tests between two clearings, which take two seconds
 _cleared = [time.process_time()]
 
 
 @pytest.fixture(scope="module", autouse=True)
 def little_memory() -> Iterator[None]:
-    """No module needs the programs of another one; kept, they take gigabytes, and ever longer collections."""
+    """No module needs the programs of another one; kept, with what else is garbage, they take gigabytes."""
     yield
     if time.process_time() - _cleared[0] > _MOST_SECONDS:
         jax.clear_caches()
