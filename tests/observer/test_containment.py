@@ -81,6 +81,7 @@ VARIANTS = ("S4a, no certificate", "S5 without unknown inputs", "S7, no certific
 SLICE = [pytest.param(name, marks=pytest.mark.soak) if name in VARIANTS else name for name in CASES]
 
 
+@pytest.mark.plain_xla
 @pytest.mark.parametrize("name", SLICE)
 def test_zero_violations(name):
     case, runs = CASES[name]

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from gsisio_jax import Interval
 from gsisio_jax.design.abstraction import affine_abstraction
@@ -11,6 +12,7 @@ def f(x):
     return jnp.stack([jnp.sin(3 * x[0]) + 0.1 * x[1], 1e3 * x[0] * x[1]])
 
 
+@pytest.mark.plain_xla
 def test_planes_of_32_bits_enclose_what_those_of_64_bits_do():
     region = Interval([0.1, -0.7], [1.3, 0.9])
     planes = affine_abstraction(f, region, mesh=3)

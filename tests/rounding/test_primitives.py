@@ -19,6 +19,7 @@ DTYPES = [np.float64, np.float32]
 SLICES = [(np.float64, NAMES[0::12]), (np.float32, NAMES[6::12])]
 
 
+@pytest.mark.plain_xla
 @pytest.mark.parametrize(("dtype", "names"), SLICES, ids=["float64", "float32"])
 def test_no_value_lies_outside_of_its_bounds(dtype, names):
     tally = Tally()
@@ -55,6 +56,7 @@ def test_forms_made_of_others_hold_too():
     assert check_forms("reciprocal", 0, 512, 24, np.float32).misses == 0
 
 
+@pytest.mark.plain_xla
 def test_the_two_oracles_agree():
     """crival's intervals contain the balls' numbers, and where the function is one of crival's own nothing else."""
     rng = np.random.default_rng(6)
