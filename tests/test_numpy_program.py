@@ -1,5 +1,6 @@
 """Programs of NumPy operations say what JAX says, whether they are run one by one or as Python's code."""
 
+import math
 from itertools import product
 
 import jax
@@ -128,6 +129,29 @@ def test_arrays_are_those_of_jax(name, dtype, monkeypatch):
         program = numpy_function(function, points[0])
         for a in points:
             _same(program(a), compiled(a), signs=name not in ("elements", "numbers", "reduced", "order", "keys"))
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_functions_of_every_entry_are_those_of_jax_whatever_the_length(dtype):
+    """They are compiled for few lengths only; of the last bit XLA says this for one length, that for another."""
+    x = np.random.default_rng(0).uniform(0.05, 0.95, 20).astype(dtype)
+
+    def functions(x):
+        of_one = [f(x) for f in (jax.lax.sin, jax.lax.exp, jax.lax.log, jax.lax.tanh, jax.lax.rsqrt)]
+        return [*of_one, jax.lax.acosh(1 + x), jax.lax.atan2(x, 1 - x), jax.lax.pow(x, 1 - x)]
+
+    def found(x):
+        return numpy_function(functions, x)(x)
+
+    for own, of_jax in zip(found(x[:15].reshape(3, 5)), functions(jnp.asarray(x[:15])), strict=True):
+        assert own.dtype == dtype
+        np.testing.assert_array_max_ulp(own.reshape(-1), np.asarray(of_jax), 2)
+    whole = found(x)
+    for shape in ((0,), (1, 1), (16,), (17,), (2, 5, 2)):
+        given = x[: math.prod(shape)].reshape(shape)
+        for own, entries in zip(found(given), whole, strict=True):
+            assert own.shape == shape
+            np.testing.assert_array_max_ulp(own.reshape(-1), entries[: own.size], 2)
 
 
 def _same(found, wanted, signs=True):

@@ -16,7 +16,8 @@ What runs a few times only is not worth compiling, and runs in NumPy:
 
     numpy_program     a jaxpr as NumPy operations, run one by one
     numpy_numbers     a program of numbers as such operations, without tracing it
-    numpy_operations  the operations; numpy_layout and numpy_source: as expressions of Python, for what runs oftener
+    numpy_operations  the operations; numpy_library  what is given to JAX
+    numpy_source      operations as expressions of Python, for what runs oftener; numpy_layout  those that move entries
 
 Gains that are concrete are constants here: zeros cost nothing, signs are known, magnitudes are computed while tracing.
 No simplification changes a bit of the result, but for the sign of a zero.

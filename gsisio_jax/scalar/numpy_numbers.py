@@ -10,7 +10,8 @@ import jax
 import numpy as np
 
 from gsisio_jax.scalar.graph import Number, is_constant
-from gsisio_jax.scalar.numpy_operations import operation_of, plain
+from gsisio_jax.scalar.numpy_library import plain
+from gsisio_jax.scalar.numpy_operations import operation_of
 from gsisio_jax.scalar.program import ScalarProgram, bound
 from gsisio_jax.scalar.unroll import ArrayOperation
 

@@ -1,4 +1,4 @@
-"""Operations of a jaxpr in NumPy; what is not written here is given to JAX, one operation at a time.
+"""Operations of a jaxpr in NumPy; what is not written here is given to JAX (`numpy_library`).
 
 So are transcendental functions: bounds stand on the accuracy of the library that the observer runs on.
 """
@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import Any
 
-import jax
 import numpy as np
 
+from gsisio_jax.scalar.numpy_library import given_to_jax
 from gsisio_jax.scalar.numpy_source import FLOATING_ONLY
 
 
@@ -41,42 +40,13 @@ def operation_of(
             return lambda x: (np.rint(x),)
         if name == "sort" and params["num_keys"] == 1 and given[0].dtype.kind in "fiub":
             return lambda *args: _sort(params["dimension"], *args)
-    return None if primitive is None else _given_to_jax(primitive, params)
+    return None if primitive is None else given_to_jax(primitive, params, given)
 
 
 def elementwise(name: str, given: Sequence[Any]) -> Callable[..., Any] | None:
     """The operation without parameters, on arrays of one shape; None if it is not NumPy's."""
     floating = given and given[0].dtype.kind == "f"
     return _ELEMENTWISE.get(name) if floating or name not in FLOATING_ONLY else None
-
-
-def _given_to_jax(primitive: Any, params: dict[str, Any]) -> Callable[..., Sequence[Any]]:
-    by_jax, several = _by_jax(primitive, tuple(params.items())), primitive.multiple_results
-
-    def bound(*args: Any) -> Sequence[Any]:
-        out = by_jax(*args)
-        return [plain(value) for value in (out if several else [out])]
-
-    return bound
-
-
-def plain(value: Any, dtype: Any = None) -> Any:
-    """As an array of NumPy, which has no random keys: those stay what they are."""
-    kind = getattr(value, "dtype", None)
-    return np.asarray(value, dtype) if kind is None or isinstance(kind, np.dtype) else value
-
-
-def _by_jax(primitive: Any, params: tuple[tuple[str, Any], ...]) -> Callable[..., Any]:
-    try:
-        return _jitted(primitive, params)
-    except TypeError:  # parameters that have no hash
-        return lambda *args: primitive.bind(*map(plain, args), **dict(params))
-
-
-@lru_cache(512)
-def _jitted(primitive: Any, params: tuple[tuple[str, Any], ...]) -> Callable[..., Any]:
-    """One for equal operations: a third of what `bind` takes."""
-    return jax.jit(lambda *args: primitive.bind(*args, **dict(params)))
 
 
 def _sign(x: Any) -> Any:

@@ -14,8 +14,9 @@ import numpy as np
 
 from gsisio_jax._collector import rare_collection
 from gsisio_jax._room import with_room
+from gsisio_jax.scalar.numpy_library import plain
 from gsisio_jax.scalar.numpy_numbers import SAME, add_numbers, has_numbers_of_numpy
-from gsisio_jax.scalar.numpy_operations import numpy_operation, plain
+from gsisio_jax.scalar.numpy_operations import numpy_operation
 from gsisio_jax.scalar.numpy_source import Operation, as_code
 from gsisio_jax.scalar.primitive import numbers_of, written
 from gsisio_jax.scalar.unroll import called_jaxpr
