@@ -11,7 +11,7 @@ import pytest
 from gsisio_jax.interval.minmax import cut, raised, smaller
 from gsisio_jax.interval.primitives import scale, times
 from gsisio_jax.scalar import call, numpy_program, scalar_program, scan
-from gsisio_jax.scalar.numpy_program import numpy_function
+from gsisio_jax.scalar.numpy_program import numpy_function, numpy_functions
 from gsisio_jax.scalar.program import ScalarProgram
 from gsisio_jax.scalar.unroll import ArrayOperation
 
@@ -163,6 +163,27 @@ def _same(found, wanted, signs=True):
         if own.dtype.kind == "f" and signs:  # the sign of max(0, -0) is anyone's, and which of these comes first
             zero = own == 0
             np.testing.assert_array_equal(np.signbit(own[zero]), np.signbit(other[zero]))
+
+
+def test_parts_of_a_result_are_programs_of_their_own_that_compute_what_they_need(monkeypatch):
+    traced, done = [], []
+
+    def several(a, b):
+        traced.append(1)
+        shared, heavy = jnp.sin(a) + 1, b @ b
+        return {"x": shared, "y": (a, 2.0)}, heavy.sum(), (), jax.lax.scan(lambda c, row: (c + row, c), shared, b)
+
+    given = np.linspace(0, 1, 3), np.linspace(-1, 1, 9).reshape(3, 3)
+    operation = numpy_program._operation
+    monkeypatch.setattr(numpy_program, "_operation", lambda eqn: done.append(eqn.primitive.name) or operation(eqn))
+    parts = numpy_functions(several, *given)
+    assert not done  # they are made when they are called
+    _same(parts[0](*given), several(*given)[0])
+    assert "sin" in done
+    assert not {"dot_general", "scan"} & set(done)
+    for part, wanted in zip(parts, several(*given), strict=True):
+        _same(part(*given), wanted)
+    assert len(traced) == 3  # once for all programs, and twice here
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

@@ -318,18 +318,28 @@ def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def bounds(box: Interval, *args: Any) -> Any:
-        box = _typed("affine", box, args)
-
-        def finish(node: Node, box: Interval) -> tuple[AffineForm, Any]:
-            slope = slope_of(node, InputBox.of(box))
-            slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
-            good, bounds = jnp.isfinite(add_up(abs(slope))), guard(node.range)
-            slope, slack = (where(good[..., None], v, 0) for v in (slope, slack))
-            return AffineForm(slope, choose(good, guard(node.offset), bounds), bounds), slack
-
-        return _run(f, box, _variable, args, finish)
+        return _run(f, _typed("affine", box, args), _variable, args, _finish_with_slack)
 
     return bounds
+
+
+def affine_and_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
+    """`affine_with_slack` and `jacobian`, which has all that the former needs: one walk through f for both."""
+
+    def bounds(box: Interval, *args: Any) -> Any:
+        box = _typed("affine", box, args)
+        start = partial(_variable, derivative=True)
+        return _run(f, box, start, args, lambda node, box: (_finish_with_slack(node, box), _finish_jacobian(node, box)))
+
+    return bounds
+
+
+def _finish_with_slack(node: Node, box: Interval) -> tuple[AffineForm, Any]:
+    slope = slope_of(node, InputBox.of(box))
+    slope, slack = (jnp.moveaxis(jnp.asarray(v), 0, -1) for v in (slope, slack_of(node, slope)))
+    good, bounds = jnp.isfinite(add_up(abs(slope))), guard(node.range)
+    slope, slack = (where(good[..., None], v, 0) for v in (slope, slack))
+    return AffineForm(slope, choose(good, guard(node.offset), bounds), bounds), slack
 
 
 def _finish_jacobian(node: Node, box: Interval) -> Interval:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,14 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import inclusion
-from gsisio_jax.inclusion.transforms import AffineForm, affine_with_slack
+from gsisio_jax.inclusion.transforms import AffineForm, affine_and_jacobian
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.cast import cast_known
-from gsisio_jax.scalar.numpy_program import numpy_function
+from gsisio_jax.scalar.numpy_program import numpy_functions
 
+_Program = Callable[..., Any]
 BoundsOfBox = Callable[[Interval], tuple[AffineForm, np.ndarray]]
 """Affine bounds of a function of x on a box, and the slack of their slope."""
+SlopesOfBox = Callable[..., "Slopes"]
+"""`Slopes` on a box of x; on one of u, too, if it is given."""
 
 
 class Slopes(eqx.Module):
@@ -62,16 +66,20 @@ class Slopes(eqx.Module):
         return self.near_affine(self.F_radius, self.E_radius, self.Z_radius)
 
 
-def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) -> Callable[..., Slopes]:
+def slopes_of(system: Any, T2: Any, u_box: Interval, dtype: Any = np.float64) -> SlopesOfBox:
     """Enclosures of the Jacobians as a function of the box (and of that of u), uniformly over `u_box` where no other is
-    given; traced once for all boxes, run in NumPy, and computed in that type whatever JAX is set to."""
+    given; traced once for all boxes, run in NumPy, and computed in that type whatever JAX is set to. `Enclosures` have
+    affine bounds, too."""
+    bounds = inclusion.jacobian(all_maps(system, T2, dtype))
+    return _slopes(system, _traced_once(lambda *boxes: (bounds(*boxes),), 1)[0], u_box, dtype)
 
-    program = _traced_once(inclusion.jacobian(all_maps(system, T2, dtype)))
+
+def _slopes(system: Any, jacobian: _Program, u_box: Interval, dtype: Any) -> SlopesOfBox:
     ends = np.cumsum([system.n, system.l])
 
     def on(box: Interval, u: Interval = u_box) -> Slopes:
         with _able_to_hold(dtype):
-            center, radius = _center_and_distance(program(known(box, dtype), known(u, dtype)))
+            center, radius = _center_and_distance(jacobian(known(box, dtype), known(u, dtype)))
         F, E, Z = zip(np.split(center, ends), np.split(radius, ends), strict=True)
         return Slopes(*F, *E, *Z)
 
@@ -90,31 +98,35 @@ def all_maps(system: Any, T2: Any, dtype: Any) -> Callable[[Any, Any], Any]:
 
 
 class Enclosures(NamedTuple):
-    """What is known of a plant on a box of states, uniformly over a box of known inputs; traced once for all boxes.
+    """What is known of a plant on a box of states, uniformly over a box of known inputs; the maps are walked through
+    once for all of it and for all boxes.
 
     Attributes:
-        slopes: from `slopes_of`.
-        outputs: from `outputs_of`.
-        maps: from `affine_maps_of`.
+        slopes: as from `slopes_of`.
+        outputs: affine bounds of T2 g on a box of states, and the slack of their slope (q, n): every step begins with
+            those on the state bounds. Source: theory 5.3.
+        maps: the same of [f; g; T2 g]; None where they take u, or angles come back to where they were.
     """
 
-    slopes: Callable[..., Slopes]
+    slopes: SlopesOfBox
     outputs: BoundsOfBox
     maps: BoundsOfBox | None
 
     @staticmethod
     def of(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> Enclosures:
-        maps = affine_maps_of(system, T2, dtype)
-        outputs = outputs_of(system, T2, u_region, dtype) if maps is None else _last_rows(maps, system.n + system.l)
-        return Enclosures(slopes_of(system, T2, u_region, dtype), outputs, maps)
+        of_all, first = affine_and_jacobian(all_maps(system, T2, dtype)), system.n + system.l
 
+        def bounds(x: Interval, u: Interval) -> tuple[Any, Any, Any]:
+            affine, jacobian = of_all(x, u)
+            return jacobian, affine, jax.tree.map(lambda rows: rows[first:], affine)
 
-def _last_rows(bounds: BoundsOfBox, first: int) -> BoundsOfBox:
-    def on(box: Interval) -> tuple[AffineForm, np.ndarray]:
-        form, slack = bounds(box)
-        return jax.tree.map(lambda side: side[first:], form), slack[first:]
-
-    return on
+        jacobian, maps, outputs = _traced_once(bounds, 3)
+        at_any_input = system.takes_u or system.periodic_states
+        return Enclosures(
+            _slopes(system, jacobian, u_region, dtype),
+            _affine(outputs, u_region, dtype),
+            None if at_any_input else _affine(maps, u_region, dtype),
+        )
 
 
 def known(box: Interval, dtype: Any) -> Interval:
@@ -124,16 +136,16 @@ def known(box: Interval, dtype: Any) -> Interval:
     return Interval.unchecked(*rounding.normal(*sides))
 
 
-def _traced_once(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`numpy_function` of it, made at the first call, for the shapes and types of all."""
-    program: list[Callable[..., Any]] = []
+def _traced_once(function: Callable[..., tuple[Any, ...]], parts: int) -> list[_Program]:
+    """`numpy_functions` of it, made at the first call, for the shapes and types of all."""
+    programs: list[_Program] = []
 
-    def run(*boxes: Interval) -> Any:
-        if not program:
-            program.append(numpy_function(function, *boxes))
-        return program[0](*boxes)
+    def of(part: int, *boxes: Interval) -> Any:
+        if not programs:
+            programs.extend(numpy_functions(function, *boxes))
+        return programs[part](*boxes)
 
-    return run
+    return [partial(of, part) for part in range(parts)]
 
 
 def _able_to_hold(dtype: Any) -> Any:
@@ -151,29 +163,8 @@ def _center_and_distance(jacobian: Interval) -> tuple[np.ndarray, np.ndarray]:
     return center, np.where(lower == upper, 0.0, np.nextafter(radius, np.inf))
 
 
-def outputs_of(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> BoundsOfBox:
-    """Affine bounds of T2 g on a box of states, uniformly over `u_region`, and the slack of their slope (q, n): every
-    step begins with those on the state bounds.
-
-    Source: theory 5.3.
-    """
-    matrix = np.asarray(T2, dtype)
-    return affine_of(lambda x, u: matrix @ system.measurement(x, u), u_region, dtype)
-
-
-def affine_maps_of(system: Any, T2: Any, dtype: Any) -> BoundsOfBox | None:
-    """Affine bounds of [f; g; T2 g] on a box of states; None where they take u, or angles come back to where they
-    were."""
-    if system.takes_u or system.periodic_states:
-        return None
-    nothing = np.zeros(system.m, dtype)
-    return affine_of(all_maps(system, T2, dtype), Interval.unchecked(nothing, nothing), dtype)
-
-
-def affine_of(function: Callable[..., Any], u_region: Interval, dtype: Any) -> BoundsOfBox:
-    """Affine bounds of a function of x and u as a function of the box of x, uniformly over `u_region`, and the slack of
-    their slope (q, n); traced once for all boxes, as in `slopes_of`, and computed once for each."""
-    program = _traced_once(affine_with_slack(function))
+def _affine(program: _Program, u_region: Interval, dtype: Any) -> BoundsOfBox:
+    """Affine bounds and their slack as a function of the box of x, uniformly over `u_region`; once for each."""
     found: dict[bytes, tuple[AffineForm, np.ndarray]] = {}
 
     def on(box: Interval) -> tuple[AffineForm, np.ndarray]:

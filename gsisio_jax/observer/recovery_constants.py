@@ -34,7 +34,7 @@ class AffineMaps:
 
     @classmethod
     def of(cls, bounds: BoundsOfBox | None, state_bounds: Interval) -> AffineMaps | None:
-        """From `affine_maps_of`; None where there are no such bounds."""
+        """From `Enclosures.maps`; None where there are no such bounds."""
         if bounds is None:
             return None
         form, slack = bounds(state_bounds)

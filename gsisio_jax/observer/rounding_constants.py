@@ -98,7 +98,7 @@ def with_rounding_constants(
         observer: with all arrays in NumPy, in `dtype` but for those that are filled in here.
         plant: the system as it was given, in float64.
         region, everywhere: enclosures of the derivatives on the region and on the state bounds.
-        form, slack: from `outputs_of`.
+        form, slack: from `Enclosures.outputs`.
         affine: bounds that rows of recovery stand on; needed where there are any.
         dtype: float64 or float32.
         slices: slopes of the certified gain on parts of the region.

@@ -6,6 +6,7 @@ Its operations are those of `numpy_operations`; what runs often becomes Python's
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -43,6 +44,45 @@ def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[...,
     closed, shape = jax.make_jaxpr(function, return_shape=True)(*example)
     program, structure = numpy_program(closed), jax.tree.structure(shape)
     return lambda *args: jax.tree.unflatten(structure, program(*jax.tree.leaves(args)))
+
+
+def numpy_functions(function: Callable[..., Any], *example: Any) -> list[Callable[..., Any]]:
+    """`numpy_function` for each of the results of a function that returns several: it is traced once for all of them,
+    and a program computes what its result needs."""
+    with rare_collection():
+        closed, shapes = with_room(jax.make_jaxpr(function, return_shape=True))(*example)
+    found, first = [], 0
+    for shape in shapes:
+        leaves, structure = jax.tree.flatten(shape)
+        last = first + len(leaves)
+        found.append(_Part(_leading_to(closed, closed.jaxpr.outvars[first:last]), structure))
+        first = last
+    return found
+
+
+class _Part:
+    """A program that is made when it is called for the first time."""
+
+    def __init__(self, closed: Any, structure: Any):
+        self._closed, self._structure = closed, structure
+
+    def __call__(self, *args: Any) -> Any:
+        return jax.tree.unflatten(self._structure, self._program(*jax.tree.leaves(args)))
+
+    @cached_property
+    def _program(self) -> Callable[..., list[Any]]:
+        return numpy_program(self._closed)
+
+
+def _leading_to(closed: Any, results: Sequence[Any]) -> Any:
+    """The jaxpr of these results alone."""
+    needed, kept = {v for v in results if not isinstance(v, jex.Literal)}, []
+    for eqn in reversed(closed.jaxpr.eqns):
+        if not needed.isdisjoint(eqn.outvars):
+            needed.update(v for v in eqn.invars if not isinstance(v, jex.Literal))
+            kept.append(eqn)
+    info = closed.jaxpr.debug_info._replace(result_paths=None)
+    return jex.ClosedJaxpr(closed.jaxpr.replace(eqns=kept[::-1], outvars=list(results), debug_info=info), closed.consts)
 
 
 @with_room

@@ -11,7 +11,8 @@ from oracles.uncompiled import in_numpy
 from oracles.uncompiled_bounds import at_points
 
 from gsisio_jax import inclusion
-from gsisio_jax.interval import Interval
+from gsisio_jax.inclusion.transforms import affine_and_jacobian, affine_with_slack
+from gsisio_jax.interval import Interval, rounding
 
 BOUNDS = ("natural", "affine", "jacobian", "mean_value")
 
@@ -131,6 +132,17 @@ def test_gradients_match_finite_differences(f):
     gradient = np.asarray(in_numpy(jax.jacrev(flat))(p))
     values = at_points(flat, np.concatenate([p + step, p - step]))
     np.testing.assert_allclose(gradient, (values[:5] - values[5:]).T / 2e-6, atol=1e-7, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", DELICATE)
+def test_one_walk_for_affine_bounds_and_derivatives_finds_what_two_do(name):
+    """Also where no end of the box is known, and rounded outward."""
+    for side, mode in ((0.5, "outward"), (np.inf, "outward"), (0.5, "nearest")):
+        box = Interval([-side, 0.25], [0.75, side])
+        with rounding.using(mode):
+            affine, jacobian = affine_and_jacobian(DELICATE[name])(box)
+            apart = affine_with_slack(DELICATE[name])(box), inclusion.jacobian(DELICATE[name])(box)
+        jax.tree.map(np.testing.assert_array_equal, (affine, jacobian), apart)
 
 
 def test_float32_in_float32_out():
