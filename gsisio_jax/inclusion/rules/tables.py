@@ -5,6 +5,8 @@ the extremes of ``phi(t) - s t`` lie at a, at b or at a knot between them, for e
 maxima over the knots, exact but for rounding, and the derivative is the hull of the slopes of the segments that [a, b]
 meets.
 
+At two knots in the same place phi jumps: the value of the first is a limit from the left, that of the second is taken.
+
 Rounding: knots and values are numbers as they stand. Slopes are computed in fractions while tracing and kept as the two
 floating numbers around each. A value at a, ``v_i + m_i (a - t_i)``, is off by ``4 eps (|v_i| + |m_i (a - t_i)|)``.
 """
@@ -14,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import partial, wraps
+from functools import cached_property, partial, wraps
 from typing import Any
 
 import jax
@@ -44,14 +46,14 @@ def whole(fn: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True, eq=False)
 class PiecewiseLinear:
-    """A piecewise-linear function, continuous between its first and last knot.
+    """A piecewise-linear function.
 
     Attributes:
-        knots: (K,), increasing.
+        knots: (K,), increasing but for pairs where it jumps; at either end there is none.
         values: (K,).
         tails: slope before the first knot and after the last one: 0, or that of the first and last segment.
         beyond: value next to the first and last knot, outside; where it is not that of the knot, the function jumps.
-        low, high: (K + 1,), the floating numbers around the slope of every segment, tails included.
+        low, high: (K + 1,), the floating numbers around the slope of every segment, tails included; 0 between a pair.
     """
 
     knots: np.ndarray
@@ -68,7 +70,8 @@ class PiecewiseLinear:
         """From a table; beyond its ends the function keeps its values, or those of `beyond`, or goes on as it was."""
         knots, values = np.asarray(knots), np.asarray(values)
         t, v = [Fraction(float(x)) for x in knots], [Fraction(float(x)) for x in values]
-        slopes = [(v[i + 1] - v[i]) / (t[i + 1] - t[i]) for i in range(len(t) - 1)] or [Fraction(0)]
+        runs = [t[i + 1] - t[i] for i in range(len(t) - 1)]
+        slopes = [(v[i + 1] - v[i]) / run if run else Fraction(0) for i, run in enumerate(runs)] or [Fraction(0)]
         exact = [slopes[0], *slopes, slopes[-1]] if extrapolates else [Fraction(0), *slopes, Fraction(0)]
         low, high = (np.array([near(slope, side, knots.dtype) for slope in exact]) for side in (-1, 1))
         tails = (float(exact[0]), float(exact[-1]))
@@ -79,10 +82,18 @@ class PiecewiseLinear:
     def jumps(self) -> tuple[bool, bool]:
         return bool(self.beyond[0] != self.values[0]), bool(self.beyond[1] != self.values[-1])
 
+    @cached_property
+    def _pairs(self) -> np.ndarray:
+        """(K - 1,): is there a jump between a knot and the next one?"""
+        return self.knots[1:] == self.knots[:-1]
+
     def _at(self, t: Any) -> tuple[Any, Any]:
         """Value at t, and what its error goes with."""
         # Segment i ends at knot i: 0 is the left tail.
-        i = (t[..., None] > self.knots).sum(-1)
+        passed = t[..., None] > self.knots
+        if self._pairs.any():  # where phi jumps it has the value on the right
+            passed |= (t[..., None] == self.knots) & (np.append(self._pairs, False) | np.insert(self._pairs, 0, False))
+        i = passed.sum(-1)
         # A knot is an end of its segment, whose value it has: t = t_0 lies in no tail that jumps.
         first = t == self.knots[0]
         i = jnp.where(first, min(1, len(self.knots) - 1), i)
@@ -105,6 +116,8 @@ class PiecewiseLinear:
         """``phi - s t`` at every knot, which of them lie between a and b, and what the error goes with."""
         knots, values = self.knots, self.values
         inside = met = (a[..., None] <= knots) & (knots <= b[..., None])
+        if self._pairs.any():  # a limit from the left is one of the interval's own only if that reaches there
+            inside = met & ((a[..., None] < knots) | ~np.append(self._pairs, False))
         reaches = a < self.knots[0], b > self.knots[-1]
         for k, jump in zip((0, -1), self.jumps, strict=True):
             if jump:
@@ -165,6 +178,10 @@ class PiecewiseLinear:
         ):  # fmt: skip
             if jump:
                 lower, upper = jnp.where(over, -jnp.inf, lower), jnp.where(over, jnp.inf, upper)
+        if self._pairs.any():
+            at = self.knots[1:][self._pairs]
+            over = ((a[..., None] < at) & (at <= b[..., None])).any(-1)
+            lower, upper = jnp.where(over, -jnp.inf, lower), jnp.where(over, jnp.inf, upper)
         return Interval.unchecked(lower, upper)
 
     def line(self, a: Any, b: Any, natural: Interval) -> tuple[Any, Interval]:
@@ -199,6 +216,14 @@ class PiecewiseLinear:
         return jnp.where(usable, s, 0), rest, usable
 
 
+def _kept(knots: np.ndarray) -> np.ndarray:
+    """A mask of increasing knots: of those in the same place the first and the last one; at either end of the table the
+    inner one, as a tail has the value beyond."""
+    places = np.arange(len(knots))
+    first, last = np.searchsorted(knots, knots) == places, np.searchsorted(knots, knots, "right") == places + 1
+    return (first & (knots != knots[0])) | (last & (knots != knots[-1])) | (len(knots) == 1)
+
+
 def near(slope: Fraction, side: int, dtype: Any) -> Any:
     """The next floating number on that side of a fraction; itself where it is one. Tables outlive the kind of rounding
     that they were made under, so it does not matter here."""
@@ -216,7 +241,7 @@ def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLi
     with the body at and around all knots, so whatever else an option may do (`period`), it is not taken for a table.
     """
     knots, values = np.asarray(knots), np.asarray(values)
-    if knots.ndim != 1 or not (np.diff(knots) > 0).all() or not np.isfinite([knots, values]).all():
+    if knots.ndim != 1 or not (np.diff(knots) >= 0).all() or not np.isfinite([knots, values]).all():
         return None
     body = jex.jaxpr_as_fun(eqn.params["jaxpr"])
     aval = eqn.invars[0].aval
@@ -232,10 +257,15 @@ def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLi
     span = float(knots[-1] - knots[0]) or 1.0
     steps = np.array([2.0, 1.0, 1e-3]) * span
     middles = 0.5 * knots[1:] + 0.5 * knots[:-1]
-    points = np.concatenate([knots, middles, knots[0] - steps, knots[-1] + steps]).astype(aval.dtype)
+    beside = [np.nextafter(knots, side).astype(knots.dtype) for side in (-np.inf, np.inf)]
+    points = np.concatenate([knots, middles, *beside, knots[0] - steps, knots[-1] + steps]).astype(aval.dtype)
     theirs = np.asarray(numpy_function(at, points)(points))
     left, right = theirs[-6:-3], theirs[-3:]
     flat = [bool((side == side[0]).all()) for side in (left, right)]
+    kept = _kept(knots)
+    if not kept.any():
+        return None
+    knots, values = knots[kept], values[kept]
     if all(flat):
         found = PiecewiseLinear.of(knots, values, (float(left[0]), float(right[0])))
     elif not any(flat):
