@@ -26,13 +26,14 @@ from gsisio_jax.inclusion.rules.functions import CURVES
 from gsisio_jax.inclusion.rules.gates import GATES
 from gsisio_jax.inclusion.rules.linear import add, move, multiple, negative, subtract, total
 from gsisio_jax.inclusion.rules.order import count_below
+from gsisio_jax.inclusion.rules.periodic_tables import PeriodicTable, periodic
 from gsisio_jax.inclusion.rules.tables import PiecewiseLinear, interpolation
 from gsisio_jax.inclusion.rules.univariate import apply
 from gsisio_jax.interval.box import Interval, choose, entire_like
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 Rule = Callable[..., list[Any] | None]
-_TABLES: dict[Any, PiecewiseLinear | None] = {}
+_TABLES: dict[Any, PiecewiseLinear | PeriodicTable | None] = {}
 _MOST_TABLES = 256  # kept of one process
 
 
@@ -68,7 +69,7 @@ def _interp(eqn: Any, x: Any, knots: Any, values: Any, *others: Any) -> list[Any
     if key not in _TABLES:
         if len(_TABLES) >= _MOST_TABLES:
             _TABLES.pop(next(iter(_TABLES)))  # the oldest
-        _TABLES[key] = interpolation(eqn, knots, values, others)
+        _TABLES[key] = interpolation(eqn, knots, values, others) or periodic(eqn, knots, values, others)
     table = _TABLES[key]
     if table is None:
         return None

@@ -112,6 +112,11 @@ class PiecewiseLinear:
                 value = jnp.where(t == side, float(side * np.sign(tail)), value)
         return value, jnp.where(finite, size, abs(start))
 
+    def values_at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values at known points, and what their errors go with."""
+        with rounding.using("nearest"):
+            return numpy_function(self._at, points)(points)
+
     def _points(self, a: Any, b: Any, s: Any) -> tuple[Any, Any, Any]:
         """``phi - s t`` at every knot, which of them lie between a and b, and what the error goes with."""
         knots, values = self.knots, self.values
@@ -272,7 +277,6 @@ def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLi
         found = PiecewiseLinear.of(knots, values, extrapolates=True)
     else:
         return None
-    with rounding.using("nearest"):
-        ours = numpy_function(found._at, points)(points)[0]
+    ours = found.values_at(points)[0]
     scale = 1e-5 if aval.dtype == np.float32 else 1e-11
     return found if np.allclose(ours, theirs, rtol=scale, atol=scale * (np.abs(values).max() + 1)) else None
