@@ -17,6 +17,7 @@ THREE = ([0.1, -0.5, 0.3], [0.9, 0.4, 0.8])
 KNOTS = np.linspace(0.0, 1.0, 50)
 TABLE = np.sin(5 * KNOTS) + 0.1 * np.cos(40 * KNOTS)
 FEW, VALUES = np.array([0.0, 0.3, 0.6, 1.0]), np.array([0.0, 1.0, 0.5, 2.0])
+STEPS = np.array([0.0, 0.25, 0.25, 1.0])
 
 Case = tuple[Callable[[Any], Any], tuple[list[float], list[float]]]
 
@@ -81,6 +82,8 @@ def _tables() -> dict[str, Case]:
         "interp, 50 knots": (lambda x: jnp.interp(x, KNOTS, TABLE), ([0.42, 0.1], [0.44, 0.9])),
         "interp, 4 knots": (lambda x: jnp.interp(x, FEW, VALUES), ([-0.5, 0.35], [1.5, 0.55])),
         "interp, left and right": (lambda x: jnp.interp(x[0], FEW, VALUES, left=-1.0, right=3.0), ([-0.5], [1.5])),
+        "interp, steps": (lambda x: jnp.interp(x, STEPS, VALUES), ([0.1, 0.25], [0.4, 0.45])),
+        "interp, period": (lambda x: jnp.interp(x, FEW[:-1], VALUES[:-1], period=1.0), ([0.8, -7.3], [1.1, -6.8])),
         "interp of sin": (lambda x: jnp.interp(jnp.sin(x[0] + x[1]), FEW, VALUES), USUAL),
         "interp, values of x": (lambda x: jnp.interp(0.4, FEW, VALUES * x[0]) + x[1], USUAL),
         "take": (lambda x: jnp.take(VALUES, (4 * x[0]).astype(int)), USUAL),
