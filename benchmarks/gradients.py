@@ -49,7 +49,10 @@ def main() -> int:
         print(line(case, results[case]), flush=True)
     checked = {case: result for case, result in results.items() if case != "memory"}
     if set(checked) == set(SYSTEMS):
-        rows = [[SYSTEMS[case], *(f"{e:.1e}" for e in one["worst"].values())] for case, one in checked.items()]
+        rows = [
+            [SYSTEMS[case], *(f"{e:.1e}".replace("e-0", "e-") for e in one["worst"].values())]
+            for case, one in checked.items()
+        ]
         keep("gradients", ["system", *next(iter(checked.values()))["worst"]], rows, results=results)
     return 0 if all(result["ok"] for result in results.values()) else 1
 
