@@ -1,4 +1,4 @@
-"""Machines: an arm, a drive with Coulomb friction written in two ways, the attitude of a satellite."""
+"""Machines: an arm, drives with Coulomb friction (written in two ways) and with tables, the attitude of a satellite."""
 
 from __future__ import annotations
 
@@ -90,6 +90,31 @@ def friction_stop() -> Model:
     return _drive(lambda v, step: v - jnp.sign(v) * jnp.minimum(jnp.abs(v), step * 0.5), 1e-3)
 
 
+def cogging() -> Model:
+    """The angle of a motor whose magnets hold it back, six times a turn, by a table of the angle; a brake that takes
+    hold from 3 rad/s on is a table with a step. 10 ms a step."""
+    dt, sixth = 0.01, np.pi / 3
+    angles = np.linspace(0, sixth, 9)[:-1]
+    held = 0.4 * np.sin(6 * angles) + 0.2 * np.sin(12 * angles)  # N m, for an inertia of 1 kg m2
+    speeds, brake = np.array([-100.0, -3.0, -3.0, 3.0, 3.0, 100.0]), np.array([-0.5, -0.2, 0.0, 0.0, 0.2, 0.5])
+
+    def f(x):
+        angle, speed = x
+        torques = jnp.interp(angle, angles, held, period=sixth) + jnp.interp(speed, speeds, brake)
+        return [angle + dt * speed, speed - dt * torques]
+
+    system = gx.System(f, lambda x: x, G=[[0.0], [dt]], H=np.zeros((2, 1)))
+    return Model(
+        system,
+        gx.Noise(w=symmetric(1e-4, 1e-3), v=symmetric(0.02, 0.3)),
+        initial=Interval([0.0, 1.0], [1.0, 3.0]),
+        region=Interval([-INF, -20.0], [INF, 20.0]),
+        d=lambda k: 2.0 * jnp.sin(0.03 * k)[:, None],  # N m
+        design={"window": 1, "certify": False},  # the brake jumps
+        wide=[0.04, 0.6],
+    )
+
+
 def attitude() -> Model:
     """Unit quaternion of a satellite by its gyroscope; sun sensor and magnetometer give six outputs. No unknown input.
 
@@ -126,4 +151,10 @@ def attitude() -> Model:
     )
 
 
-MODELS = {"arm": arm, "friction_ramp": friction_ramp, "friction_stop": friction_stop, "attitude": attitude}
+MODELS = {
+    "arm": arm,
+    "friction_ramp": friction_ramp,
+    "friction_stop": friction_stop,
+    "attitude": attitude,
+    "cogging": cogging,
+}

@@ -7,8 +7,8 @@ import pytest
 from models.gallery import MODELS
 from models.runner import estimate, misses, records
 
-# A look-up table and a wrapped angle: rules that have branches of their own in float32.
-BOTH_PRECISIONS = ("battery", "heading", "engine")
+# Look-up tables and a wrapped angle: rules that have branches of their own in float32.
+BOTH_PRECISIONS = ("battery", "heading", "engine", "cogging")
 # Products of rounded numbers alone, and a division: what rounding to nearest leaves out.
 BOTH_ROUNDINGS = ("sir", "cstr")
 
