@@ -323,13 +323,14 @@ def affine_with_slack(f: Callable[..., Any]) -> Callable[..., Any]:
     return bounds
 
 
-def affine_and_jacobian(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`affine_with_slack` and `jacobian`, which has all that the former needs: one walk through f for both."""
+def affine_and_jacobian(f: Callable[..., Any], with_slack: bool = False) -> Callable[..., Any]:
+    """`affine` (or `affine_with_slack`) and `jacobian`, which has all that the former needs: one walk through f."""
+    affine = _finish_with_slack if with_slack else _finish_affine
 
     def bounds(box: Interval, *args: Any) -> Any:
         box = _typed("affine", box, args)
         start = partial(_variable, derivative=True)
-        return _run(f, box, start, args, lambda node, box: (_finish_with_slack(node, box), _finish_jacobian(node, box)))
+        return _run(f, box, start, args, lambda node, box: (affine(node, box), _finish_jacobian(node, box)))
 
     return bounds
 

@@ -114,7 +114,7 @@ class Enclosures(NamedTuple):
 
     @staticmethod
     def of(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> Enclosures:
-        of_all, first = affine_and_jacobian(all_maps(system, T2, dtype)), system.n + system.l
+        of_all, first = affine_and_jacobian(all_maps(system, T2, dtype), with_slack=True), system.n + system.l
 
         def bounds(x: Interval, u: Interval) -> tuple[Any, Any, Any]:
             affine, jacobian = of_all(x, u)

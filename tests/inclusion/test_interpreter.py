@@ -140,9 +140,10 @@ def test_one_walk_for_affine_bounds_and_derivatives_finds_what_two_do(name):
     for side, mode in ((0.5, "outward"), (np.inf, "outward"), (0.5, "nearest")):
         box = Interval([-side, 0.25], [0.75, side])
         with rounding.using(mode):
-            affine, jacobian = affine_and_jacobian(DELICATE[name])(box)
-            apart = affine_with_slack(DELICATE[name])(box), inclusion.jacobian(DELICATE[name])(box)
-        jax.tree.map(np.testing.assert_array_equal, (affine, jacobian), apart)
+            jacobian = inclusion.jacobian(DELICATE[name])(box)
+            for slack, affine in ((False, inclusion.affine), (True, affine_with_slack)):
+                together, apart = affine_and_jacobian(DELICATE[name], slack)(box), affine(DELICATE[name])(box)
+                jax.tree.map(np.testing.assert_array_equal, together, (apart, jacobian))
 
 
 def test_float32_in_float32_out():

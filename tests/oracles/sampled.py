@@ -12,6 +12,8 @@ import numpy as np
 from oracles.uncompiled import in_numpy
 
 from gsisio_jax import Interval, inclusion
+from gsisio_jax.inclusion.transforms import affine_and_jacobian
+from gsisio_jax.interval.rounding import using
 
 SETTINGS = (("outward", np.float64), ("outward", np.float32), ("nearest", np.float64))
 
@@ -29,9 +31,13 @@ def bounds(fn: Callable[..., Any], lower: Any, upper: Any, rounding: str, dtype:
 def _program(fn: Callable[..., Any], rounding: str) -> Callable[..., Any]:
     def call(low: Any, high: Any) -> Any:
         box = Interval.unchecked(low, high)
-        form = inclusion.affine(fn, rounding)(box)  # type: ignore[arg-type]
         natural = inclusion.natural(fn, rounding)(box)  # type: ignore[arg-type]
-        jac = inclusion.jacobian(fn, rounding)(box)  # type: ignore[arg-type]
+        if (rounding, low.dtype) == SETTINGS[0]:
+            form = inclusion.affine(fn, rounding)(box)  # type: ignore[arg-type]
+            jac = inclusion.jacobian(fn, rounding)(box)  # type: ignore[arg-type]
+        else:  # what both have in common, which is nearly all, is walked through once
+            with using(rounding):  # type: ignore[arg-type]
+                form, jac = affine_and_jacobian(fn)(box)
         return {"natural": natural, "affine": form.range, "slope": form.slope, "offset": form.offset, "jacobian": jac}
 
     return in_numpy(call)
