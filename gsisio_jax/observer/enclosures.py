@@ -115,18 +115,21 @@ class Enclosures(NamedTuple):
     @staticmethod
     def of(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> Enclosures:
         of_all, first = affine_and_jacobian(all_maps(system, T2, dtype), with_slack=True), system.n + system.l
+        outputs_alone = system.takes_u or system.periodic_states
 
-        def bounds(x: Interval, u: Interval) -> tuple[Any, Any, Any]:
+        def bounds(x: Interval, u: Interval) -> tuple[Any, Any]:
             affine, jacobian = of_all(x, u)
-            return jacobian, affine, jax.tree.map(lambda rows: rows[first:], affine)
+            return _rows_from(first, affine) if outputs_alone else affine, jacobian
 
-        jacobian, maps, outputs = _traced_once(bounds, 3)
-        at_any_input = system.takes_u or system.periodic_states
-        return Enclosures(
-            _slopes(system, jacobian, u_region, dtype),
-            _affine(outputs, u_region, dtype),
-            None if at_any_input else _affine(maps, u_region, dtype),
-        )
+        affine, jacobian = _traced_once(bounds, 2)
+        slopes, found = _slopes(system, jacobian, u_region, dtype), _affine(affine, u_region, dtype)
+        if outputs_alone:
+            return Enclosures(slopes, found, None)
+        return Enclosures(slopes, lambda box: _rows_from(first, found(box)), found)
+
+
+def _rows_from(first: int, affine: Any) -> Any:
+    return jax.tree.map(lambda rows: rows[first:], affine)
 
 
 def known(box: Interval, dtype: Any) -> Interval:

@@ -46,11 +46,12 @@ def numpy_function(function: Callable[..., Any], *example: Any) -> Callable[...,
     return lambda *args: jax.tree.unflatten(structure, program(*jax.tree.leaves(args)))
 
 
+@with_room
+@rare_collection()
 def numpy_functions(function: Callable[..., Any], *example: Any) -> list[Callable[..., Any]]:
     """`numpy_function` for each of the results of a function that returns several: it is traced once for all of them,
     and a program computes what its result needs."""
-    with rare_collection():
-        closed, shapes = with_room(jax.make_jaxpr(function, return_shape=True))(*example)
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*example)
     found, first = [], 0
     for shape in shapes:
         leaves, structure = jax.tree.flatten(shape)

@@ -14,17 +14,14 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
-import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.rules.tables import PiecewiseLinear, whole
-from gsisio_jax.inclusion.rules.univariate import extremes
+from gsisio_jax.inclusion.rules.piecewise import continuous_to
+from gsisio_jax.inclusion.rules.tables import PiecewiseLinear, agree, looked_up, whole
+from gsisio_jax.inclusion.rules.univariate import hull_of
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose
-from gsisio_jax.scalar.numpy_program import numpy_function
-
-_CLOSED = 1e-9  # gaps up to this share of the largest value are rounding of the knots
 
 
 class _Moved(NamedTuple):
@@ -73,10 +70,7 @@ class PeriodicTable:
         return _Moved(first, choose(goes_on, rest, first), goes_on, shift, usable)
 
     def _hull(self, bounds: Callable[[Any, Any], Interval], moved: _Moved) -> Interval:
-        parts = [bounds(part.lower, part.upper) for part in (moved.first, moved.rest)]
-        return Interval.unchecked(
-            extremes([part.lower for part in parts]).lower, extremes([part.upper for part in parts]).upper
-        )
+        return hull_of([bounds(part.lower, part.upper) for part in (moved.first, moved.rest)])
 
     def _wider(self, found: Interval) -> Interval:
         slip = 3 * self.gap  # two for derivatives, one for what of the table is beyond its ends
@@ -101,7 +95,7 @@ class PeriodicTable:
         low, high = moved.first.lower, jnp.where(moved.goes_on, moved.rest.upper, moved.first.upper)
         length = jnp.where(moved.goes_on, high + (self.period - low), high - low)
         wide = length > 1e-3 * self.period
-        slopes = self.derivative(a, b)
+        slopes = self._hull(self.table.derivative, moved)
         middle = 0.5 * slopes.lower + 0.5 * slopes.upper
         rise = self.table._at(high)[0] - self.table._at(low)[0]
         s = jnp.where(wide, rise / jnp.where(wide, length, 1), middle)
@@ -116,10 +110,8 @@ class PeriodicTable:
                 rounding.raised(found.upper - by, abs(found.upper) + abs(by), 4.0),
             )
 
-        parts = [part(moved.first, moved.shift)]
-        parts.append(part(moved.rest, jnp.where(moved.goes_on, moved.shift + self.period, moved.shift)))
-        lower, upper = extremes([p.lower for p in parts]).lower, extremes([p.upper for p in parts]).upper
-        return s, self._wider(Interval.unchecked(lower, upper)), usable
+        further = jnp.where(moved.goes_on, moved.shift + self.period, moved.shift)
+        return s, self._wider(hull_of([part(moved.first, moved.shift), part(moved.rest, further)])), usable
 
 
 def periodic(eqn: Any, knots: Any, values: Any, others: Any) -> PeriodicTable | None:
@@ -134,31 +126,21 @@ def periodic(eqn: Any, knots: Any, values: Any, others: Any) -> PeriodicTable | 
     # As jax.numpy computes them: a constant expression of the model is the number that it evaluates to.
     places = np.mod(knots, period)
     order = np.argsort(places, kind="stable")
-    places, values = places[order], values[order]
+    places, heights = places[order], values[order]
     around = np.concatenate([places[-1:] - period, places, places[:1] + period])
     if not (np.diff(around) > 0).all():
         return None
-    table = PiecewiseLinear.of(around, np.concatenate([values[-1:], values, values[:1]]))
+    table = PiecewiseLinear.of(around, np.concatenate([heights[-1:], heights, heights[:1]]))
     ends, sizes = table.values_at(np.array([0, period], knots.dtype))
     eps = np.finfo(knots.dtype).eps
     steepest = np.abs([table.low[1], table.high[1], table.low[-2], table.high[-2]]).max()
     gap = abs(ends[1] - ends[0]) + eps * (8 * sizes.sum() + 2 * period * steepest)
-    if not gap <= max(_CLOSED, 64 * eps) * max(abs(values).max(), 1):
+    if not gap <= continuous_to(knots.dtype) * max(abs(values).max(), 1):
         return None
-    body, aval = jex.jaxpr_as_fun(eqn.params["jaxpr"]), eqn.invars[0].aval
-    own = eqn.params["jaxpr"].in_avals[1:3]
-    given = [np.asarray(part, to.dtype) for part, to in zip((knots, values[np.argsort(order)]), own, strict=True)]
-
-    @jax.vmap
-    def at(t: Any) -> Any:
-        return body(jnp.full(aval.shape, t, aval.dtype), *given, *others)[0].ravel()[0]
-
     first = np.concatenate(
         [places, 0.5 * around[1:] + 0.5 * around[:-1], *(places + d * period for d in (-1e-3, 1e-3))]
     )
-    points = np.concatenate([first + k * period for k in range(-2, 3)]).astype(aval.dtype)
-    theirs = np.asarray(numpy_function(at, points)(points))
+    points = np.concatenate([first + k * period for k in range(-2, 3)])
+    points, theirs = looked_up(eqn, knots, values, others, points)
     ours = table.values_at(np.mod(points, period).astype(knots.dtype))[0]
-    scale = 1e-5 if aval.dtype == np.float32 else 1e-11
-    found = PeriodicTable(table, period, gap)
-    return found if np.allclose(ours, theirs, rtol=scale, atol=scale * (np.abs(values).max() + 1)) else None
+    return PeriodicTable(table, period, gap) if agree(ours, theirs, values, points.dtype) else None

@@ -51,7 +51,6 @@ from gsisio_jax.interval.box import Interval, choose, entire_like, intersect, ma
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import times
 
-_CONTINUOUS = 1e-9  # jumps up to this share of the value count as rounding of the model's own numbers
 _DEPTH: ContextVar[int] = ContextVar("gsisio_jax_piecewise_depth", default=0)
 _DEEPEST = 2  # pieces within pieces that are evaluated once more
 
@@ -88,6 +87,11 @@ def by_pieces(eqn: Any, args: Sequence[Any], plain: Node, apply: Apply, elementw
     finally:
         _DEPTH.reset(token)
     return _hull(plain, switch, cases, jumps)
+
+
+def continuous_to(dtype: Any) -> float:
+    """Jumps up to this share of the value count as rounding of the model's own numbers."""
+    return max(1e-9, 64 * float(jnp.finfo(dtype).eps))
 
 
 def _fits(switch: Switch) -> bool:
@@ -202,7 +206,7 @@ def _loose(form: Form | None) -> Form | None:
 
 def _hull(plain: Node, switch: Switch, cases: Sequence[_Case], jumps: Sequence[_Jump]) -> Node:
     pivot = normalised(switch.pivot)
-    tolerance = max(_CONTINUOUS, 64 * float(jnp.finfo(plain.dtype).eps))
+    tolerance = continuous_to(plain.dtype)
     small = [[jump <= tolerance * jnp.maximum(j.size, 1) for jump in (j.below, j.above)] for j in jumps]
     slip = sum(jnp.where(ok[0], j.below, 0) + jnp.where(ok[1], j.above, 0) for ok, j in zip(small, jumps, strict=True))
     possible = [case.possible for case in cases]

@@ -24,7 +24,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.inclusion.rules.univariate import extremes
+from gsisio_jax.inclusion.rules.univariate import hull_of
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose
 from gsisio_jax.scalar.numpy_program import numpy_function
@@ -142,8 +142,9 @@ class PiecewiseLinear:
             value, size = self._at(t)
             if s is not None:
                 value, size = value - s * t, size + abs(s * t)
-            ends.append((rounding.lowered(value, size, 8.0), rounding.raised(value, size, 8.0)))
-        bounds = Interval.unchecked(extremes([e[0] for e in ends]).lower, extremes([e[1] for e in ends]).upper)
+            low, high = rounding.lowered(value, size, 8.0), rounding.raised(value, size, 8.0)
+            ends.append(Interval.unchecked(low, high))
+        bounds = hull_of(ends)
         values, inside, size = self._points(a, b, s)
         low, high = (values, values) if size is None else (
             rounding.lowered(values, size, 4.0), rounding.raised(values, size, 4.0)
@@ -177,15 +178,13 @@ class PiecewiseLinear:
         met = self.met(a, b)
         lower = jnp.where(met, self.low, jnp.inf).min(-1)
         upper = jnp.where(met, self.high, -jnp.inf).max(-1)
-        for jump, over in zip(
-            self.jumps, ((a < self.knots[0]) & (b >= self.knots[0]), (a <= self.knots[-1]) & (b > self.knots[-1])),
-            strict=True,
-        ):  # fmt: skip
-            if jump:
-                lower, upper = jnp.where(over, -jnp.inf, lower), jnp.where(over, jnp.inf, upper)
+        first, last = self.jumps
+        jumped = [(a < self.knots[0]) & (b >= self.knots[0])] if first else []
+        jumped += [(a <= self.knots[-1]) & (b > self.knots[-1])] if last else []
         if self._pairs.any():
             at = self.knots[1:][self._pairs]
-            over = ((a[..., None] < at) & (at <= b[..., None])).any(-1)
+            jumped.append(((a[..., None] < at) & (at <= b[..., None])).any(-1))
+        for over in jumped:
             lower, upper = jnp.where(over, -jnp.inf, lower), jnp.where(over, jnp.inf, upper)
         return Interval.unchecked(lower, upper)
 
@@ -248,8 +247,30 @@ def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLi
     knots, values = np.asarray(knots), np.asarray(values)
     if knots.ndim != 1 or not (np.diff(knots) >= 0).all() or not np.isfinite([knots, values]).all():
         return None
-    body = jex.jaxpr_as_fun(eqn.params["jaxpr"])
-    aval = eqn.invars[0].aval
+    kept = _kept(knots)
+    if not kept.any():
+        return None
+    span = float(knots[-1] - knots[0]) or 1.0
+    steps = np.array([2.0, 1.0, 1e-3]) * span
+    middles = 0.5 * knots[1:] + 0.5 * knots[:-1]
+    beside = [np.nextafter(knots, side).astype(knots.dtype) for side in (-np.inf, np.inf)]
+    points = np.concatenate([knots, middles, *beside, knots[0] - steps, knots[-1] + steps])
+    points, theirs = looked_up(eqn, knots, values, others, points)
+    left, right = theirs[-6:-3], theirs[-3:]
+    flat = [bool((side == side[0]).all()) for side in (left, right)]
+    knots, values = knots[kept], values[kept]
+    if all(flat):
+        found = PiecewiseLinear.of(knots, values, (float(left[0]), float(right[0])))
+    elif not any(flat):
+        found = PiecewiseLinear.of(knots, values, extrapolates=True)
+    else:
+        return None
+    return found if agree(found.values_at(points)[0], theirs, values, points.dtype) else None
+
+
+def looked_up(eqn: Any, knots: Any, values: Any, others: Any, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points in the type of the argument of a call of ``jnp.interp``, and what the call says there."""
+    body, aval = jex.jaxpr_as_fun(eqn.params["jaxpr"]), eqn.invars[0].aval
     # A table in float32 (made where that is all JAX has) stays one in the program, also where x is in float64.
     table = [
         np.asarray(part, to.dtype) for part, to in zip((knots, values), eqn.params["jaxpr"].in_avals[1:3], strict=True)
@@ -259,24 +280,11 @@ def interpolation(eqn: Any, knots: Any, values: Any, others: Any) -> PiecewiseLi
     def at(t: Any) -> Any:
         return body(jnp.full(aval.shape, t, aval.dtype), *table, *others)[0].ravel()[0]
 
-    span = float(knots[-1] - knots[0]) or 1.0
-    steps = np.array([2.0, 1.0, 1e-3]) * span
-    middles = 0.5 * knots[1:] + 0.5 * knots[:-1]
-    beside = [np.nextafter(knots, side).astype(knots.dtype) for side in (-np.inf, np.inf)]
-    points = np.concatenate([knots, middles, *beside, knots[0] - steps, knots[-1] + steps]).astype(aval.dtype)
-    theirs = np.asarray(numpy_function(at, points)(points))
-    left, right = theirs[-6:-3], theirs[-3:]
-    flat = [bool((side == side[0]).all()) for side in (left, right)]
-    kept = _kept(knots)
-    if not kept.any():
-        return None
-    knots, values = knots[kept], values[kept]
-    if all(flat):
-        found = PiecewiseLinear.of(knots, values, (float(left[0]), float(right[0])))
-    elif not any(flat):
-        found = PiecewiseLinear.of(knots, values, extrapolates=True)
-    else:
-        return None
-    ours = found.values_at(points)[0]
-    scale = 1e-5 if aval.dtype == np.float32 else 1e-11
-    return found if np.allclose(ours, theirs, rtol=scale, atol=scale * (np.abs(values).max() + 1)) else None
+    points = points.astype(aval.dtype)
+    return points, np.asarray(numpy_function(at, points)(points))
+
+
+def agree(ours: np.ndarray, theirs: np.ndarray, values: np.ndarray, dtype: Any) -> bool:
+    """Are these values of one function, at points of this type?"""
+    scale = 1e-5 if dtype == np.float32 else 1e-11
+    return bool(np.allclose(ours, theirs, rtol=scale, atol=scale * (np.abs(values).max() + 1)))

@@ -93,6 +93,13 @@ def extremes(values: list[Any]) -> Interval:
     return Interval.unchecked(lower, upper)
 
 
+def hull_of(boxes: list[Interval]) -> Interval:
+    """The smallest box that contains several boxes."""
+    return Interval.unchecked(
+        extremes([box.lower for box in boxes]).lower, extremes([box.upper for box in boxes]).upper
+    )
+
+
 @dataclass(frozen=True)
 class Piece:
     """A continuous function on an interval of the line, monotone or with one turning point at 0.
