@@ -12,9 +12,8 @@ import numpy as np
 
 from gsisio_jax.continuous import maps
 from gsisio_jax.continuous.merging import merged
+from gsisio_jax.inclusion.rules.makers import library_function
 from gsisio_jax.traced import equations
-
-_JAX = jax.__file__.rpartition("/")[0]
 
 
 class Field:
@@ -79,8 +78,8 @@ class Field:
                 return "jax.lax.stop_gradient"
             if name.startswith("custom_"):
                 body = equation.params.get("call_jaxpr", equation.params.get("fun_jaxpr"))
-                source = getattr(getattr(body, "jaxpr", body).debug_info, "func_src_info", None) or ""
-                if not source.partition(" at ")[2].startswith(_JAX):
+                if not library_function(getattr(body, "jaxpr", body)):
+                    source = getattr(getattr(body, "jaxpr", body).debug_info, "func_src_info", None) or ""
                     return f"the derivative rule of `{source.partition(' at ')[0]}` (jax.{name.removesuffix('_call')})"
         return ""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
@@ -12,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion import affine, jacobian
+from gsisio_jax.inclusion.rules.makers import library_function
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.rounding import outward
 from gsisio_jax.scalar.numpy_program import numpy_function
@@ -140,14 +140,13 @@ def _magnitude(box: Interval, moving: np.ndarray, what: str, smoothness: str) ->
 
 def _foreign_rule(jaxpr: Any) -> str | None:
     """What makes JAX differentiate something other than f: a custom rule that is not JAX's own, or stop_gradient."""
-    home = f" at {os.path.dirname(jax.__file__)}"
     for eqn in jaxpr.eqns:
         name, values = eqn.primitive.name, list(eqn.params.values())
-        infos = [getattr(getattr(value, "jaxpr", value), "debug_info", None) for value in values]
-        sources = [getattr(info, "func_src_info", None) or "" for info in infos if info is not None]
+        bodies = [body for value in values if hasattr(body := getattr(value, "jaxpr", value), "debug_info")]
         if name == "stop_gradient":
             return "stop_gradient"
-        if name.startswith("custom_") and not (sources and all(home in source for source in sources)):
+        if name.startswith("custom_") and not (bodies and all(map(library_function, bodies))):
+            sources = [getattr(body.debug_info, "func_src_info", None) or "" for body in bodies]
             return f"a custom derivative rule ({', '.join(sources)})"
         nested = [getattr(v, "jaxpr", v) for value in values for v in (value if isinstance(value, tuple) else [value])]
         for inner in nested:

@@ -29,6 +29,7 @@ from gsisio_jax.inclusion.rules import comparison, linear, patterns
 from gsisio_jax.inclusion.rules.functions import CURVES
 from gsisio_jax.inclusion.rules.indexing import TooManyPlacesError
 from gsisio_jax.inclusion.rules.library import EXACT, WHOLE
+from gsisio_jax.inclusion.rules.makers import library_function
 from gsisio_jax.inclusion.rules.piecewise import by_pieces
 from gsisio_jax.inclusion.rules.registry import ELEMENTWISE, LIBRARY, MOVES, REDUCTIONS, ROUNDED, UnknownPrimitiveError
 from gsisio_jax.inclusion.turns import TurnsError, while_loop
@@ -178,14 +179,13 @@ def _call(eqn: Any, *args: Any) -> Any:
         jaxpr, consts = called_jaxpr(eqn)
     except LookupError:
         raise UnknownPrimitiveError(eqn.primitive.name, "without a body") from None
-    name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
-    ours = source.startswith(_JAX)
-    whole = WHOLE.get(name) if ours else None
+    name = library_function(jaxpr)
+    whole = WHOLE.get(name)
     if whole is not None and (given := _given(name, eqn, args)) is not None:
         found = whole(eqn, *given)
         if found is not None:
             return [normalise(value) if is_node(value) else value for value in found]
-    if name in LIBRARY and ours and any(is_node(arg) for arg in args):
+    if name in LIBRARY and any(is_node(arg) for arg in args):
         return [normalise(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
     return evaluate(jaxpr, consts, args)
 

@@ -64,6 +64,8 @@ def _expanded(a: Node) -> Node:
 
 # Factors --------------------------------------------------------------------------------------------------------------
 def _entries(a: Node) -> list[list[Any]]:
+    if len(a.shape) != 2:
+        raise NotImplementedError("of several matrices at once; take them one by one")
     n, m = a.shape
     return [[move(lambda v, i=i, j=j: v[i, j], a) for j in range(m)] for i in range(n)]
 

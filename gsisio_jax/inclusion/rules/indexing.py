@@ -66,6 +66,8 @@ def _reached(possible: Any, rows: Node, moves: bool, outside: Any = None) -> Nod
     """The hull; where the place may lie `outside`, nothing is known."""
     if rows.dtype == bool:
         lower, upper = (~possible | rows.range.lower).all(0), (possible & rows.range.upper).any(0)
+        if outside is not None:
+            lower, upper = lower & ~outside, upper | outside
         return Node(Interval.unchecked(lower, upper))
     if not jnp.issubdtype(rows.dtype, jnp.floating):
         rows = Node(Interval.unchecked(*(side.astype(float) for side in (rows.range.lower, rows.range.upper))))

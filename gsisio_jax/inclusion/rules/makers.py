@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.extend.core as jex
 import numpy as np
 
@@ -14,6 +16,13 @@ from gsisio_jax.inclusion.node import Node
 
 _KEEPS = ("stop_gradient", "copy", "optimization_barrier")
 MOST_TERMS = 64  # of a sum that is known as a whole
+_JAX = os.path.join(os.path.dirname(jax.__file__), "")  # with a separator: other packages may begin with its name
+
+
+def library_function(jaxpr: Any) -> str:
+    """The name of the function of JAX's own libraries whose body this is, or nothing."""
+    name, _, source = (getattr(jaxpr.debug_info, "func_src_info", None) or "").partition(" at ")
+    return name if source.startswith(_JAX) else ""
 
 
 @dataclass
@@ -59,26 +68,13 @@ class Makers:
         kept = tuple(1 if axis in axes else n for axis, n in enumerate(shape))
         if atom.aval.shape == () and rest == ():
             return atom
-        while True:
-            eqn = self.made(atom, "broadcast_in_dim", "reshape", "squeeze", "expand_dims", *_KEEPS)
-            if eqn is None:
-                break
-            name, inner = eqn.primitive.name, eqn.invars[0]
-            if name == "broadcast_in_dim" and atom.aval.shape in (shape, kept):
-                dims = eqn.params["broadcast_dimensions"]
-                whole = {axis: inner.aval.shape[i] for i, axis in enumerate(dims)}
-                if any(whole.get(axis, 1) != 1 for axis in axes):
-                    return None
-                if any(whole.get(axis, 1) != n for axis, n in enumerate(shape) if axis not in axes):
-                    return None
-            elif name != "broadcast_in_dim" and math.prod(inner.aval.shape) == math.prod(rest):
-                pass
-            elif name not in _KEEPS:
-                return None
-            atom = inner
-            if atom.aval.shape == rest and name not in _KEEPS:
+        chain: list[Any] = []
+        while (eqn := self.made(atom, "broadcast_in_dim", "reshape", "squeeze", "expand_dims", *_KEEPS)) is not None:
+            chain.append(eqn)
+            atom = eqn.invars[0]
+            if atom.aval.shape == rest and _places(chain, rest, kept, shape):
                 return self.plain(atom)
-        return self.plain(atom) if atom.aval.shape in (rest, kept) else None
+        return self.plain(atom) if atom.aval.shape == kept and _places(chain, rest, kept, shape) else None
 
     def same(self, a: Any, b: Any, depth: int = 4) -> bool:
         """Do they hold the same numbers: one variable, or two that were made alike (``x[0]`` twice)?"""
@@ -94,3 +90,22 @@ class Makers:
             return False
         alike = str(first.params) == str(second.params)
         return alike and all(self.same(p, q, depth - 1) for p, q in zip(first.invars, second.invars, strict=True))
+
+
+def _places(chain: Sequence[Any], rest: tuple[int, ...], kept: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Does this chain, from the last equation to the first, bring the entries of an array of shape `rest` (or `kept`)
+    to their places along the other axes? Of a square matrix sums of rows and of columns have the same shape."""
+    first: Any = chain[-1].invars[0].aval if chain else None
+    places = np.arange(math.prod(rest)).reshape(kept)
+    moved = places if first is None else places.reshape(first.shape)
+    for eqn in reversed(chain):
+        out = eqn.outvars[0].aval.shape
+        if eqn.primitive.name == "broadcast_in_dim":
+            spread = np.ones(len(out), int)
+            spread[list(eqn.params["broadcast_dimensions"])] = moved.shape
+            moved = np.broadcast_to(moved.reshape(spread), out)
+        else:
+            moved = moved.reshape(out)
+    if moved.ndim != len(shape):
+        return False
+    return bool((np.broadcast_to(moved, shape) == np.broadcast_to(places, shape)).all())

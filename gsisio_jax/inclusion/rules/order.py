@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -45,14 +46,15 @@ def _spread(value: Any, n: int) -> Any:
 
 
 def sort(eqn: Any, *operands: Any) -> list[Any]:
-    """``lax.sort`` by its first operand; the others are carried along."""
+    """``lax.sort`` by its first operand, or by several constant ones; the others are carried along."""
     axis, keys = eqn.params["dimension"], eqn.params["num_keys"]
     if keys > 1 and any(is_node(v) for v in operands[1:keys]):
         raise NotImplementedError("by several keys of which later ones depend on the box")
     key = operands[0]
     if not is_node(key):
         # Only what is carried along depends on the box: places are known.
-        order = jnp.argsort(key, axis=axis, stable=True)
+        places = jnp.broadcast_to(jnp.arange(key.shape[axis]).reshape(-1, *(1,) * (key.ndim - axis - 1)), key.shape)
+        order = jax.lax.sort((*operands[:keys], places), dimension=axis, is_stable=True, num_keys=keys)[-1]
         return [
             structural(lambda v: jnp.take_along_axis(v, order, axis), [v], [order])[0]
             if is_node(v)

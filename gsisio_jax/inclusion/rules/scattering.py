@@ -63,6 +63,8 @@ def scatter_sub(eqn: Any, operand: Any, indices: Any, updates: Any) -> Node:
 
 def scatter(eqn: Any, operand: Any, indices: Any, updates: Any) -> Node | None:
     """The last update of a place is the one that stays; several for one place are not known to be in order."""
+    if eqn.params.get("update_jaxpr") is not None:  # what it updates with is nothing
+        raise NotImplementedError("that applies a function (for `x.at[i].apply(h)` write `x.at[i].set(h(x[i]))`)")
     met = meets(eqn, indices)
     if met is None or (met.sum(1) > 1).any():
         return None

@@ -207,6 +207,8 @@ def _exact_inverse(a: np.ndarray) -> np.ndarray | None:
 def triangular_solve(eqn: Any, a: Any, b: Any) -> Any:
     """As any other system: the other triangle is 0, and the diagonal 1 where that is asked for."""
     left, lower, transposed, unit = (eqn.params[key] for key in ("left_side", "lower", "transpose_a", "unit_diagonal"))
+    if len(_shape(a)) != 2:
+        raise NotImplementedError("of several matrices at once; take them one by one")
     n = _shape(a)[-1]
     mask = np.tril(np.ones((n, n), bool)) if lower else np.triu(np.ones((n, n), bool))
 

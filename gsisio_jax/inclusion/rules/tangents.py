@@ -104,6 +104,8 @@ class Tangents:
         values = _MOVES[found.name] or range(len(found.operands))
         if any(t is not None and i not in values for i, t in enumerate(tangents)) or found.index:
             return None
+        if not jnp.issubdtype(found.equation.outvars[0].aval.dtype, jnp.floating):  # truth values jump
+            return None
         fixed, terms = list(found.operands), 1
         if found.name == "reduce_sum":
             terms = int(np.prod([found.operands[0].shape[axis] for axis in found.equation.params["axes"]]))
