@@ -166,7 +166,7 @@ def design_observer(
             chosen offline from simulated runs. 1 looks back one step; 3 to 5 come close to the exact hull where one
             step does not (rotations, chains, networks), at some more operations a step. "auto" takes 3, or 5, where
             some state gets 5 % narrower by it, else 1: in simulated runs with the slopes of the region, or with fixed
-            ones; and as many rows as are worth the time that they add to a step. It stays at 1 for more than 10 states,
+            ones; and as many rows as are worth the time that they add to a step. It stays at 1 for more than 20 states,
             for periodic ones, and where slopes have no bounds.
         delay: L: bound x[k] from y[0..k+L], for plants whose unknown input shows only L steps later (a force, where
             positions are measured), or to smooth. Outputs, but for those of step k, must be affine in the state, and

@@ -39,6 +39,7 @@ from gsisio_jax.design.region import Near, find_region, grown_around
 from gsisio_jax.design.slices import what_split_gives, with_slices
 from gsisio_jax.design.tolerant import Guessed, tolerant
 from gsisio_jax.design.undefined import undefined_in
+from gsisio_jax.design.window import what_windows_may_give
 from gsisio_jax.design.window_with_less import window_rows_with_less
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
@@ -173,6 +174,8 @@ def design_current(
     if maps is not None:
         rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
         observer = replace(observer, recovery=rows_alone)
+    if window == "auto" and observer.window is None:
+        observer = replace(observer, certificate=observer.certificate.with_notes(what_windows_may_give(observer)))
     say("bounding what rounding leaves")
     observer = finished(observer)
     if dials.cells != 1:

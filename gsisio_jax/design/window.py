@@ -14,12 +14,13 @@ from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window_runs import Rows
 from gsisio_jax.design.window_search import WORTH, Search
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.observer.types import Observer
 from gsisio_jax.observer.window import Window
 
 _ROUNDS = 4  # of runs, each with all rows so far
 _TRIED = (3, 5)  # windows that "auto" looks at
 _THINNER = (16, 8, 4, 2)  # rows a state that are tried, the first ones of a bank, where all cost more than they bring
-_MOST_STATES = 10  # beyond, the programs of "auto" would take too long
+_MOST_STATES = 20  # beyond, the programs of "auto" would take too long
 
 
 def window_rows(
@@ -57,6 +58,16 @@ def window_rows(
         if window is not None and window.length > 1:  # rows of one step only are what `gains` is for
             return window
     return None
+
+
+def what_windows_may_give(observer: Observer) -> str:
+    """A note of what "auto", which took none, leaves to be tried; empty where that is nothing."""
+    if observer.system.n > _MOST_STATES:
+        return f'window="auto" tries none for more than {_MOST_STATES} states: `window=3` may give narrower boxes'
+    endless = set(np.flatnonzero(~np.isfinite(observer.certificate.steady_width)))
+    if endless and endless <= {state for rows in observer.recovery for state in rows.targets}:
+        return "no width is promised, but outputs of several steps determine the state: try `window=5` or `window=20`"
+    return ""
 
 
 def _worth_it(

@@ -1,5 +1,6 @@
 """What a design chooses where nothing is said: the window; and how far ``gains="auto"`` goes. Nothing is compiled."""
 
+import jax
 import numpy as np
 import pytest
 import systems
@@ -34,6 +35,36 @@ def test_the_default_looks_for_a_window():
     one = gx.design_observer(system, noise, Interval.entire(2), missing=False, window=1)
     assert default.window is not None
     assert default.certificate.steady_width[1] < 0.8 * one.certificate.steady_width[1]
+
+
+def _chain(states, turn):
+    A = np.kron(np.eye(states // 2), turn)
+    system = gx.System(lambda x: A @ x, lambda x: x, G=np.zeros((states, 0)), H=np.zeros((states, 0)))
+    noise = gx.Noise(Interval.symmetric([0.02, 0.02] * (states // 2)), Interval.symmetric([0.05, 2.0] * (states // 2)))
+    return gx.design_observer(system, noise, Interval.entire(states), missing=False)
+
+
+def test_larger_plants_get_a_window_or_are_told_of_it():
+    turn = 0.95 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    assert _chain(12, turn).window is not None
+    told = _chain(22, turn)
+    assert told.window is None
+    assert told.certificate.notes[-1].endswith("`window=3` may give narrower boxes")
+
+
+def test_a_window_is_named_where_no_width_is_promised():
+    """Position of three integrators: one step promises nothing, the outputs of several determine all."""
+    A = np.array([[1, 0.1, 0], [0, 1, 0.1], [0, 0, 1]])
+    system = gx.System(lambda x: A @ x, lambda x: x[:1], G=np.zeros((3, 0)), H=np.zeros((1, 0)))
+    noise = gx.Noise(Interval.symmetric([1e-4] * 3), Interval.symmetric([0.01]))
+    y = gx.simulate(system, jax.random.key(0), [0.0, 1, 0], np.zeros((100, 0)), noise).y
+    widths = []
+    for window in ("auto", 20):
+        observer = gx.design_observer(system, noise, Interval.entire(3), window=window)
+        widths.append(gx.estimate(observer, Interval.symmetric([1.0, 2, 1]), y).state.width[-1])
+        named = any("try `window=5` or `window=20`" in note for note in observer.certificate.notes)
+        assert named == (window == "auto")
+    assert (widths[1][1:] < 0.1 * widths[0][1:]).all()
 
 
 def _costs(monkeypatch, cost):
