@@ -20,6 +20,7 @@ from gsisio_jax.interval.reading import check_type
 from gsisio_jax.observer.checks import prepare
 from gsisio_jax.observer.enclosures import slopes_of
 from gsisio_jax.observer.estimation import Estimate
+from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.observer.input_memory import InputRows, from_rows
 from gsisio_jax.observer.maps import Maps
 from gsisio_jax.observer.measurement import typed
@@ -79,14 +80,15 @@ def mean_input(
         )
     if not all(map(is_concrete, jax.tree.leaves(observer))):
         raise ValueError("mean_input: the observer is traced by JAX, but rows come from its numbers; close over it")
-    cache = vars(observer).get("_means", {})
-    if steps not in cache:
-        with jax.ensure_compile_time_eval():
-            rows = _rows(observer, steps)
-        cache = {**cache, steps: jax.jit(lambda *record: _means(observer, rows, steps, *record))}
-        object.__setattr__(observer, "_means", cache)
+    run = Fixed.of(observer).program((_means, steps), lambda fixed: _program(fixed, steps))
     noise = Noise.unchecked(*(_by_row(part, T) for part in (noise.w, noise.v)))
-    return cache[steps](estimate.state, estimate.input, estimate.status, y, u, noise)
+    return run(estimate.state, estimate.input, estimate.status, y, u, noise)
+
+
+def _program(observer: Observer, steps: int) -> Any:
+    with jax.ensure_compile_time_eval():
+        rows = _rows(observer, steps)
+    return jax.jit(lambda *record: _means(observer, rows, steps, *record))
 
 
 def _by_row(box: Interval, T: int) -> Interval:

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax._calls import named_arguments
+from gsisio_jax._memo import once_per_observer
 from gsisio_jax.files.container import read, restore, write
-from gsisio_jax.files.once import once_per_observer
 from gsisio_jax.files.systems import described, differing_maps
 from gsisio_jax.files.tree import encode
 from gsisio_jax.interval.box import Interval, is_concrete

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.files.once import once_per_observer
+from gsisio_jax._memo import once_per_observer
 from gsisio_jax.files.program import first_difference, points, program, values
 from gsisio_jax.plant.system import System
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from typing import Any
 
 import jax
 from jax.core import Tracer
 
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.observer.fixed import Fixed
+from gsisio_jax.observer.fixed import Fixed, jitted
 from gsisio_jax.observer.types import Carry
 from gsisio_jax.plant.system import Noise
 from gsisio_jax.scalar.options import KNOWN, jaxlib_version, loops_are_functions
@@ -37,27 +37,24 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     Args:
         function: of `fixed(observer)` (two arguments), a box or carry, y, u, noise, and whether to hold.
     """
-    plain = jax.jit(function, static_argnames=("static", "hold"))
+    options = cache(lambda: _options())
 
-    @cache
-    def alone() -> Callable[..., Any]:
-        options = _options()
-        return jax.jit(function, static_argnames=("static", "hold"), compiler_options=options) if options else plain
+    def alone(value: Any) -> Callable[..., Any]:
+        return jax.jit(partial(function, None, value), static_argnames="hold", compiler_options=options())
 
     @wraps(function)
     def run(static: Fixed | None, traced: Any, box: Interval | Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
-        args = static, traced, box, y, u, noise, hold
+        args = box, y, u, noise, hold
         state = box.state if isinstance(box, Carry) else box
         # Not every leaf: flattening takes longer than a step.
         data = y, u, *(side for part in (state, noise.w, noise.v) for side in (part.lower, part.upper))
-        if static is None or any(isinstance(part, Tracer) for part in data):
-            return plain(*args)
-        try:
-            return alone()(*args)
-        except ValueError as error:  # constants inside of another program
-            if "compiler_options" not in str(error):
-                raise
-            return plain(*args)
+        if static is not None and options() and not any(isinstance(part, Tracer) for part in data):
+            try:
+                return static.program(alone, alone)(*args)
+            except ValueError as error:  # constants inside of another program
+                if "compiler_options" not in str(error):
+                    raise
+        return jitted(function, static, traced, ("hold",))(*args)
 
     return run
 

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._memo import once
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, add, entire_like
 from gsisio_jax.interval.direct import where
@@ -73,7 +74,7 @@ class DelayedObserver(Wrapped):
             with jax.ensure_compile_time_eval():  # as in `Observer.astype`
                 return replace(cast(replace(self, inner=None), dtype), inner=inner)
 
-        return self._once(dtype, made)
+        return once(self, ("type", dtype), made)
 
     def row(self, y: Any, u: Any, noise: Noise) -> tuple[Any, Noise]:
         """Measurement (l',) and noise bounds of the lifted plant for step k, from y, u and noise of k..k+L, (L+1, .).

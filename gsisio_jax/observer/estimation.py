@@ -18,7 +18,7 @@ from gsisio_jax.observer.checks import AnyObserver, check_length, check_on_confl
 from gsisio_jax.observer.compiled import compiled
 from gsisio_jax.observer.delayed import DelayedObserver, to_the_end
 from gsisio_jax.observer.fixed import Fixed, chosen, fixed
-from gsisio_jax.observer.scan import advance, begin, blank, cut, once, scan
+from gsisio_jax.observer.scan import advance, as_program, begin, blank, cut, scan
 from gsisio_jax.observer.summary import summary
 from gsisio_jax.observer.types import Carry, StepOutput, cast
 from gsisio_jax.plant.system import Noise
@@ -273,7 +273,7 @@ def _start(static: Fixed | None, traced: Any, initial: Interval, y: Any, u: Any,
 def _step(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
     _, noise = normal(carry.state, noise)
-    return once(observer, lambda c, y, u, noise: advance(observer, c, y, u, noise, hold), carry, y, u, noise)
+    return as_program(observer, lambda c, y, u, noise: advance(observer, c, y, u, noise, hold), carry, y, u, noise)
 
 
 @compiled

@@ -39,7 +39,7 @@ class Plain:
         return isinstance(other, Plain) and self._key == other._key
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)  # it holds f and g, and what they hold
 def _expansion(plain: Plain, dtype: Any) -> Expansion | None:
     return expand(plain.maps, plain.n, plain.m, dtype)
 

@@ -15,6 +15,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._memo import Remembers, once
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.intersection import bound
 from gsisio_jax.inclusion.planes import Abstraction
@@ -28,11 +29,11 @@ from gsisio_jax.observer.domain import Domain, largest_magnitude
 from gsisio_jax.observer.measurement import in_box, inside, output_box
 from gsisio_jax.observer.periodic import unwrap
 from gsisio_jax.observer.status import Source, Status, bit_mask
-from gsisio_jax.observer.types import Carry, StepOutput, cast
+from gsisio_jax.observer.types import Carry, StepOutput, cast_once
 from gsisio_jax.plant.system import Noise, System
 
 
-class PredictionObserver(eqx.Module):
+class PredictionObserver(Remembers, eqx.Module):
     """The paper's observer; a pytree whose structure holds f and g. Made by `design_observer(form="prediction")`.
 
     Attributes:
@@ -80,11 +81,11 @@ class PredictionObserver(eqx.Module):
     def with_rounding(self, rounding: Rounding) -> PredictionObserver:
         """The same observer with another rounding."""
         check_rounding("PredictionObserver.with_rounding", rounding)
-        return replace(self, rounding=rounding)
+        return once(self, ("rounding", rounding), lambda: replace(self, rounding=rounding))
 
     def astype(self, dtype: Any) -> PredictionObserver:
         """The same observer in another floating type; boxes are rounded outward."""
-        return cast(self, dtype)
+        return cast_once(self, dtype)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """As `Observer.save`."""

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 
 from gsisio_jax import scalar
+from gsisio_jax._memo import once
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import delayed, prediction_step, tolerant
 from gsisio_jax.observer import step as current_step
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.delayed import DelayedObserver
-from gsisio_jax.observer.fixed import Fixed, chosen, fixed
+from gsisio_jax.observer.fixed import Fixed, chosen, fixed, jitted
 from gsisio_jax.observer.prediction_step import PredictionObserver
 from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.observer.types import Carry, StepOutput
@@ -54,20 +55,16 @@ def blank(observer: AnyObserver, initial: Interval) -> Carry:
 
 def advance(observer: AnyObserver, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> tuple[Carry, StepOutput]:
     """One step of the recursion that belongs to this kind of observer."""
-    step = _inlined if isinstance(observer, TolerantObserver) else _called
-    return step(*fixed(as_it_steps(observer)), carry, y, u, noise, hold)
+    # What JAX traced of a step once serves the design, every batch, scan and study of that observer. A program over
+    # numbers takes a call of it apart; inlined, its thousands of equations would be copied first. A program over arrays
+    # is a tenth faster where it is inlined.
+    inline = isinstance(observer, TolerantObserver)
+    return jitted(_advance, *fixed(as_it_steps(observer)), ("hold",), inline=inline)(carry, y, u, noise, hold)
 
 
 def _advance(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
     observer = chosen(static, traced)
     return _module(observer).advance(observer, carry, y, u, noise, hold)
-
-
-# What JAX traced of a step once serves the design, every batch, scan and study of that observer. A program over numbers
-# takes a call of it apart; inlined, its thousands of equations would be copied first. A program over arrays is a tenth
-# faster where it is inlined.
-_called = jax.jit(_advance, static_argnames=("static", "hold"))
-_inlined = jax.jit(_advance, static_argnames=("static", "hold"), inline=True)
 
 
 _UNREAD: dict[str, Any] = {
@@ -79,16 +76,16 @@ _UNREAD: dict[str, Any] = {
 def as_it_steps(observer: AnyObserver) -> AnyObserver:
     """The observer without what its certificates say of lost rows, which no step reads: a design finds that out by
     trying steps, and the first call need not trace them again."""
-    found = vars(observer).get("_as_it_steps")
-    if found is None:
-        changed: dict[str, Any] = {}
-        if not isinstance(observer, TolerantObserver):
-            changed["certificate"] = replace(observer.certificate, **_UNREAD)
-        if isinstance(observer, DelayedObserver | TolerantObserver):
-            changed["inner"] = as_it_steps(observer.inner)
-        found = replace(observer, **changed)
-        object.__setattr__(observer, "_as_it_steps", found)
-    return found
+    return once(observer, as_it_steps, lambda: _stripped(observer))
+
+
+def _stripped(observer: AnyObserver) -> AnyObserver:
+    changed: dict[str, Any] = {}
+    if not isinstance(observer, TolerantObserver):
+        changed["certificate"] = replace(observer.certificate, **_UNREAD)
+    if isinstance(observer, DelayedObserver | TolerantObserver):
+        changed["inner"] = as_it_steps(observer.inner)
+    return replace(observer, **changed)
 
 
 def begin(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise, hold: bool) -> Any:
@@ -97,10 +94,10 @@ def begin(observer: AnyObserver, initial: Interval, y: Any, u: Any, noise: Noise
     def step(initial: Interval, y: Any, u: Any, noise: Noise) -> Any:
         return advance(observer, blank(observer, initial), y, u, noise, hold)
 
-    return once(observer, step, initial, y, u, noise)
+    return as_program(observer, step, initial, y, u, noise)
 
 
-def once(observer: AnyObserver, step: Callable[..., Any], *args: Any) -> Any:
+def as_program(observer: AnyObserver, step: Callable[..., Any], *args: Any) -> Any:
     """One step as a program."""
     return step(*args) if isinstance(observer, TolerantObserver) else scalar.call(step, *args)
 

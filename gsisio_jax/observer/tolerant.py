@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax import scalar
+from gsisio_jax._memo import once
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, choose, entire_like
 from gsisio_jax.observer import step as current_step
@@ -71,7 +72,8 @@ class TolerantObserver(Wrapped):
 
     def astype(self, dtype: Any) -> TolerantObserver:
         """The same observer in another floating type; boxes are rounded outward (`Observer.astype`)."""
-        return self._once(dtype, lambda: replace(self, inner=self.inner.astype(dtype)))
+        dtype = np.dtype(jax.dtypes.canonicalize_dtype(dtype))
+        return once(self, ("type", dtype), lambda: replace(self, inner=self.inner.astype(dtype)))
 
 
 class Guesses(eqx.Module):

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._memo import Remembers, memory, once
 from gsisio_jax.inclusion import AffineForm
 from gsisio_jax.inclusion.planes import Abstraction
 from gsisio_jax.interval.box import Interval, is_concrete
@@ -108,7 +109,7 @@ class ExactInputs(eqx.Module):
     complete: bool = eqx.field(static=True)
 
 
-class Observer(eqx.Module):
+class Observer(Remembers, eqx.Module):
     """A designed observer; a pytree whose structure holds f and g. Made by `design_observer`.
 
     Attributes:
@@ -181,9 +182,12 @@ class Observer(eqx.Module):
     def with_rounding(self, rounding: Rounding) -> Observer:
         """The same observer with another rounding."""
         check_rounding("Observer.with_rounding", rounding)
+        return once(self, ("rounding", rounding), lambda: self._with_rounding(rounding))
+
+    def _with_rounding(self, rounding: Rounding) -> Observer:
         found = replace(self, rounding=rounding)
-        if "_single" in vars(self) and rounding == "outward":
-            object.__setattr__(found, "_single", vars(self)["_single"])
+        if in_type in memory(self) and rounding == "outward":
+            memory(found)[in_type] = memory(self)[in_type]
         return found
 
     def astype(self, dtype: Any) -> Observer:
@@ -221,23 +225,34 @@ def in_type(observer: Observer, dtype: Any) -> Observer:
             f"Observer.astype: the floating type must be float64 or float32, got {dtype}; convert the data"
         )
     leaves = jax.tree.leaves(observer)
-    if all(leaf.dtype == dtype for leaf in leaves if hasattr(leaf, "dtype")) or observer.rounding == "nearest":
-        return cast(observer, dtype)
-    if dtype == np.float64:
-        return cast(observer, dtype)
+    same = all(leaf.dtype == dtype for leaf in leaves if hasattr(leaf, "dtype"))
+    if same or observer.rounding == "nearest" or dtype == np.float64:
+        return cast_once(observer, dtype)
     if not all(map(is_concrete, leaves)):
         raise ValueError(
             "Observer.astype: the observer is traced, but its gains in another type need numbers; call "
             "observer.astype(jnp.float32) outside of jit"
         )
-    found = vars(observer).get("_single")
-    if found is None:
-        from gsisio_jax.observer.rounding_constants import single_precision
+    return once(observer, in_type, lambda: _single(observer))
 
-        with jax.ensure_compile_time_eval():  # the observer's numbers are known, also while something else is traced
-            found = single_precision(observer)
-        object.__setattr__(observer, "_single", found)
-    return found
+
+def _single(observer: Observer) -> Observer:
+    from gsisio_jax.observer.rounding_constants import single_precision
+
+    with jax.ensure_compile_time_eval():  # the observer's numbers are known, also while something else is traced
+        return single_precision(observer)
+
+
+def cast_once(observer: Any, dtype: Any) -> Any:
+    """`cast`, the same object for every call, so that a step need not hash it again."""
+    if not all(map(is_concrete, jax.tree.leaves(observer))):
+        return cast(observer, dtype)
+
+    def made() -> Any:
+        with jax.ensure_compile_time_eval():  # what is remembered must not belong to the program that is traced
+            return cast(observer, dtype)
+
+    return once(observer, ("type", np.dtype(dtype)), made)
 
 
 def cast(tree: Any, dtype: Any) -> Any:

@@ -7,14 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 import equinox as eqx
-import numpy as np
 
+from gsisio_jax._memo import Remembers, once
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.rounding import Rounding
 from gsisio_jax.observer.types import Observer
 
 
-class Wrapped(eqx.Module):
+class Wrapped(Remembers, eqx.Module):
     """An observer around another one, `inner`."""
 
     if TYPE_CHECKING:  # a field of those that inherit, which say where among theirs
@@ -42,18 +42,10 @@ class Wrapped(eqx.Module):
 
     def with_rounding(self, rounding: Rounding) -> Self:
         """The same observer with another rounding."""
-        return replace(self, inner=self.inner.with_rounding(rounding))
+        return once(self, ("rounding", rounding), lambda: replace(self, inner=self.inner.with_rounding(rounding)))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write every number of the design into a file, as `Observer.save`."""
         from gsisio_jax.files import save_observer
 
         save_observer(path, self)  # type: ignore[arg-type]
-
-    def _once(self, dtype: Any, make: Any) -> Self:
-        """What `make` returns, made once for each type: two calls give the same object, so nothing compiles twice."""
-        found = vars(self).get("_typed", {}).get(np.dtype(dtype))
-        if found is None:
-            found = make()
-            object.__setattr__(self, "_typed", {**vars(self).get("_typed", {}), np.dtype(dtype): found})
-        return found

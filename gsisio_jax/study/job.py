@@ -112,7 +112,9 @@ class Job:
     def _common(self) -> tuple[Fixed, Any]:
         """What all tiles share: the observer, and arguments on the devices."""
         shared = self.layout.shared(self.arguments)
-        return Fixed(self.observer), jax.device_put(shared) if self.mesh is None else devices.copied(shared, self.mesh)
+        return Fixed.of(self.observer), jax.device_put(shared) if self.mesh is None else devices.copied(
+            shared, self.mesh
+        )
 
     @property
     def tiles(self) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import is_dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,7 +15,7 @@ import numpy as np
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.checks import AnyObserver
 from gsisio_jax.observer.delayed import DelayedObserver
-from gsisio_jax.observer.fixed import Fixed
+from gsisio_jax.observer.fixed import Fixed, chosen, jitted
 from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.plant.periodic import nearest
 from gsisio_jax.scalar.options import loop_bytes
@@ -64,17 +63,17 @@ def run_cases(
     Returns:
         Arrays (B, ...) by name, not waited for.
     """
-    return compiled()(observer, dict(varying), dict(shared), rows, reductions, hold, most)
+    return compiled(observer)(dict(varying), dict(shared), rows, reductions, hold, most)
 
 
-@cache
-def compiled() -> Any:
-    """The jitted function behind `run_cases`."""
-    return jax.jit(_run, static_argnames=("fixed", "rows", "reductions", "hold", "most"))
+def compiled(observer: Fixed) -> Any:
+    """The jitted function behind `run_cases`, of one observer."""
+    return jitted(_run, observer, None, ("rows", "reductions", "hold", "most"))
 
 
 def _run(
-    fixed: Fixed,
+    static: Fixed | None,
+    traced: Any,
     varying: Any,
     shared: Any,
     rows: Rows,
@@ -82,7 +81,8 @@ def _run(
     hold: bool,
     most: int,
 ) -> Any:
-    return jax.vmap(lambda one: _case(fixed.value, eqx.combine(one, shared), rows, reductions, hold, most))(varying)
+    observer = chosen(static, traced)
+    return jax.vmap(lambda one: _case(observer, eqx.combine(one, shared), rows, reductions, hold, most))(varying)
 
 
 def _case(

@@ -96,9 +96,7 @@ class Parcel:
         """
         pickle = need("cloudpickle", extra="cluster", purpose="`client`")
         try:
-            # Without what is kept beside it here, so that equal observers are equal bytes.
-            observer = jax.tree.map(lambda leaf: leaf, job.observer)
-            program = pickle.dumps((observer, job.rows, job.reductions))
+            program = pickle.dumps((job.observer, job.rows, job.reductions))
         except Exception as error:
             raise ValueError(
                 f"{job.call}: the observer cannot be sent to workers: {error}; f, g and functions of the study must "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +11,7 @@ import numpy as np
 
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import scan
-from gsisio_jax.observer.fixed import Fixed, chosen, fixed
+from gsisio_jax.observer.fixed import Fixed, chosen, fixed, jitted
 from gsisio_jax.observer.types import Observer, cast
 from gsisio_jax.plant.periodic import nearest
 from gsisio_jax.tuning.compiled import quickly
@@ -115,11 +115,10 @@ def _gradients(static: Fixed | None, traced: Any, noise: Any, records: Any, room
 SMALL, SHORT = 5000, 400
 
 
-@cache
-def _program(gradients: bool, small: bool) -> Any:
+def _program(gradients: bool, small: bool) -> Callable[..., Any]:
     function = _gradients if gradients else _values
     # The observer's numbers are constants: the program is less than half as long.
-    return (quickly if small else jax.jit)(function, static_argnames="static")
+    return lambda static, traced, *rest: jitted(function, static, traced, jit=quickly if small else jax.jit)(*rest)
 
 
 class Scores:

@@ -10,6 +10,7 @@ import pytest
 import gsisio_jax as gx
 from gsisio_jax import Interval
 from gsisio_jax.observer import compiled
+from gsisio_jax.observer.fixed import Fixed
 
 COMPILED = True
 
@@ -48,10 +49,10 @@ def test_transformations_around_a_call_change_no_number(tried):
     def program(static, traced, box, y, u, noise, hold):
         return box.lower + y[0] * noise.v.upper
 
-    jitted = compiled.compiled(program)
+    jitted, observer = compiled.compiled(program), Fixed(BOX)
 
     def of(y):
-        return jitted("an observer", None, BOX, y, None, NOISE, False)
+        return jitted(observer, None, BOX, y, None, NOISE, False)
 
     found = of(Y)
     others = [
@@ -63,7 +64,8 @@ def test_transformations_around_a_call_change_no_number(tried):
     for other in others:
         np.testing.assert_array_equal(found, other)
     assert jax.jacobian(of)(jnp.asarray(Y)).shape == (2, 3, 2)
-    assert tried[:2] == [None, compiled.TASKS]
+    assert tried[:2] == [compiled.TASKS, None]
+    assert tried.count(compiled.TASKS) == 1
 
 
 @pytest.mark.parametrize(

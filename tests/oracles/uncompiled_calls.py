@@ -57,17 +57,17 @@ def compiled(patch: pytest.MonkeyPatch) -> None:
 
 def replaced(patch: pytest.MonkeyPatch) -> None:
     """From here on; programs are kept as long as the functions that stand in."""
-    by_xla, study = kernel.compiled(), cache(_study)
+    by_xla, study = kernel.compiled, cache(_study)
 
     def run(fixed: Any, varying: Any, shared: Any, rows: Any, reductions: Any, hold: bool, most: int) -> Any:
         case = eqx.combine(jax.tree.map(lambda a: a[0], varying), shared)
         if rows.steps(case) > MOST or any(_is_shared(a) for a in jax.tree.leaves(varying)):
-            return by_xla(fixed, varying, shared, rows, reductions, hold, most)
+            return by_xla(fixed)(varying, shared, rows, reductions, hold, most)
         one, all_ = study(fixed, rows, reductions, hold, most)
         return _each(one, varying, shared) if _size(varying) <= FEW else all_(varying, shared)
 
     programs = {True: _gradients(), False: _values()}
-    patch.setattr(kernel, "compiled", lambda: run)
+    patch.setattr(kernel, "compiled", lambda fixed: partial(run, fixed))
     patch.setattr(rollout, "_program", lambda gradients, small: programs[gradients])
     patch.setattr(sensitivity, "quickly", in_numpy)
 
@@ -79,7 +79,7 @@ def _study(fixed: Any, rows: Any, reductions: Any, hold: bool, most: int) -> tup
         return kernel._case(fixed.value, eqx.combine(varying, shared), rows, reductions, hold, most)
 
     def many(varying: Any, shared: Any) -> Any:
-        return kernel._run(fixed, varying, shared, rows, reductions, hold, most)
+        return kernel._run(fixed, None, varying, shared, rows, reductions, hold, most)
 
     return in_numpy(one), in_numpy(many)
 

@@ -14,6 +14,7 @@ import numpy as np
 
 import gsisio_jax as gx
 from gsisio_jax.errors import ContainmentLost
+from gsisio_jax.observer import fixed
 from gsisio_jax.study import kernel
 from gsisio_jax.study import store as store_module
 from gsisio_jax.study.job import Job
@@ -99,7 +100,7 @@ def state() -> dict[str, Any]:
         "pid": os.getpid(),
         "x64": jax.config.jax_enable_x64,
         "pool": names.count("tf_XLAEigen"),
-        "programs": kernel.compiled()._cache_size() if kernel.compiled.cache_info().currsize else 0,
+        "programs": sum(kernel.compiled(observer)._cache_size() for observer in list(fixed._known.values())),
     }
 
 

@@ -33,7 +33,8 @@ def main() -> None:
 
     job_module.run_cases = watched
     spread = gx.sweep(**study, batch=5, mesh=mesh)
-    program = kernel.compiled().lower(*calls[-1]).compile().as_text()
+    observer, *arguments = calls[-1]
+    program = kernel.compiled(observer).lower(*arguments).compile().as_text()
 
     jobs: list[Any] = []
     run_module._compute = lambda job, *_: jobs.append(job)

@@ -16,6 +16,7 @@ import pytest
 from study import cluster_faults
 
 import gsisio_jax as gx
+from gsisio_jax.observer.fixed import Fixed
 from gsisio_jax.scalar import options
 from gsisio_jax.study import crew, kernel
 from gsisio_jax.study.store import TileStore
@@ -53,7 +54,7 @@ def test_the_bits_do_not_depend_on_threads_and_tiles(study, monkeypatch):
 
     monkeypatch.setattr(job_module, "run_cases", watched)
     expected = gx.sweep(**study, batch=CHUNK)
-    programs = kernel.compiled()._cache_size()
+    programs = kernel.compiled(Fixed.of(study["observer"]))._cache_size()
     for threads in (1, 2, 3):
         monkeypatch.setattr(crew, "usable", lambda threads=threads: threads)
         for batch in (None, 8, 10):
@@ -63,7 +64,7 @@ def test_the_bits_do_not_depend_on_threads_and_tiles(study, monkeypatch):
             names = {name for name, _ in seen[1:]}
             assert len(names) <= threads
             assert threading.current_thread().name not in names
-    assert kernel.compiled()._cache_size() == programs
+    assert kernel.compiled(Fixed.of(study["observer"]))._cache_size() == programs
 
 
 def test_threads_compute_in_the_configuration_of_the_caller():
