@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Hashable
 from functools import lru_cache, partial
 from typing import Any
-from weakref import WeakValueDictionary
+from weakref import WeakKeyDictionary, ref
 
 import jax
 import numpy as np
@@ -38,8 +38,8 @@ class Fixed:
         for array in arrays:
             digest.update(f"{array.dtype}{array.shape}".encode())
             digest.update(np.ascontiguousarray(array).tobytes())
-        self.identity = structure, digest.digest()
-        self._hash = hash(self.identity)
+        self._identity = structure, digest.digest()
+        self._hash = hash(self._identity)
         self.value = jax.tree.unflatten(structure, arrays)
         self._programs: dict[Hashable, Any] = {}
 
@@ -58,17 +58,21 @@ class Fixed:
         return self._hash
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Fixed) and self._hash == other._hash and self.identity == other.identity
+        return isinstance(other, Fixed) and self._hash == other._hash and self._identity == other._identity
 
 
-_known: WeakValueDictionary[Any, Fixed] = WeakValueDictionary()
+# The table must not hold what equality asks for: that includes f, which may hold the observer.
+_known: WeakKeyDictionary[Fixed, ref[Fixed]] = WeakKeyDictionary()
 _recent: deque[Fixed] = deque(maxlen=RECENT)
 _one_at_a_time = threading.RLock()  # a weak reference may run anything when it dies
 
 
 def _shared(made: Fixed) -> Fixed:
     with _one_at_a_time:
-        found = _known.setdefault(made.identity, made)
+        known = _known.get(made)
+        found = (known and known()) or made
+        if found is made:
+            _known[made] = ref(made)
         if found in _recent:
             _recent.remove(found)
         _recent.append(found)

@@ -100,7 +100,7 @@ def state() -> dict[str, Any]:
         "pid": os.getpid(),
         "x64": jax.config.jax_enable_x64,
         "pool": names.count("tf_XLAEigen"),
-        "programs": sum(kernel.compiled(observer)._cache_size() for observer in list(fixed._known.values())),
+        "programs": sum(kernel.compiled(observer)._cache_size() for observer in list(fixed._known)),
     }
 
 
