@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import numpy as np
 
-from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type, is_whole
 from gsisio_jax.observer.checks import refuse_input_model
 from gsisio_jax.plant.system import Noise, System
@@ -35,6 +36,7 @@ def checked(
     """
     check_type("design_observer", "system", system, System)
     check_type("design_observer", "noise", noise, Noise, "gx.Noise(w, v)")
+    _check_known(noise=noise, region=region, u_region=u_region)
     if form not in ("current", "prediction"):
         raise ValueError(f'design_observer: `form` must be "current" or "prediction", got {form!r}')
     system.check_unchanged("design_observer")
@@ -100,6 +102,17 @@ def checked(
     if u_region.shape != (system.m,):
         raise ValueError(f"design_observer: `u_region` must have shape ({system.m},), got {u_region.shape}")
     return (region if isinstance(region, Interval) else None), u_region
+
+
+def _check_known(**arguments: Any) -> None:
+    """Under jax.jit, jax.vmap and jax.grad numbers are not known yet."""
+    for name, value in arguments.items():
+        if not all(map(is_concrete, jax.tree.leaves(value))):
+            raise ValueError(
+                f"design_observer: `{name}` is traced by JAX, and must be known; design outside of jit, vmap and grad. "
+                "Widths as a function of a plant, its noise and region, with gradients, are "
+                "gx.tuning.optimal_widths; other noise at run time is estimate(noise=...)"
+            )
 
 
 def check_cells(cells: Any, form: str) -> None:

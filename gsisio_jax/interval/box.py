@@ -186,8 +186,12 @@ class Interval(eqx.Module):
 
     def astype(self, dtype: Any) -> Interval:
         """The smallest box of that floating type that contains this one (a narrowing cast rounds outward)."""
-        if not _is_floating(dtype):
-            raise ValueError(f"Interval.astype: bounds have a floating type (float64, float32), got {dtype!r}")
+        if not _rounds_outward(dtype):
+            raise ValueError(
+                "Interval.astype: bounds have a floating type (float64, float32), got "
+                f"{getattr(dtype, '__name__', None) or repr(dtype)}; in another one no bound is rounded outward, so "
+                "take float32"
+            )
         lower = cast_down(self.lower, dtype)
         if self.lower is self.upper and self.lower.dtype == lower.dtype:  # known to be a point: that stays known
             return Interval.unchecked(*rounding.normal(lower, lower))
@@ -200,9 +204,9 @@ class Interval(eqx.Module):
         return f"Interval({self.lower}, {self.upper})"
 
 
-def _is_floating(dtype: Any) -> bool:
+def _rounds_outward(dtype: Any) -> bool:
     try:
-        return jnp.issubdtype(dtype, jnp.floating)
+        return dtype is not None and np.dtype(dtype) in (np.float64, np.float32)
     except TypeError:  # no type at all
         return False
 

@@ -117,7 +117,9 @@ def estimate(
     """Boxes that are certain to contain the states and the unknown inputs of a record.
 
     Compiled once per shape; new numbers, another noise or another initial box compile nothing. Works under `jax.jit`,
-    `jax.vmap` over any of `initial`, `y`, `u`, `noise`, `length`, and `jax.grad`.
+    `jax.vmap` over any of `initial`, `y`, `u`, `noise`, `length`, and `jax.grad`. Under `jax.jit` close over the
+    observer: as an argument all its numbers are traced, and the program for any numbers compiles up to five times as
+    long.
 
     Args:
         observer: from `design_observer`.

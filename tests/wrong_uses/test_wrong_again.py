@@ -6,6 +6,8 @@ import itertools
 import time
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy.signal
 from uses import (
@@ -80,6 +82,19 @@ BOUNDS = {
 }
 BOXES = {
     "no such type": (lambda o: BOX.astype("floot"), "Interval.astype", "float64, float32", "'floot'"),
+    "a type of fewer bits": (lambda o: BOX.astype(jnp.bfloat16), "Interval.astype", "got bfloat16", "take float32"),
+    "traced noise": (
+        lambda o: jax.jit(lambda r: gx.design_observer(o.system, r, BOX))(NOISE),
+        "design_observer: `noise`",
+        "traced",
+        "optimal_widths",
+        "noise=",
+    ),
+    "traced region": (
+        lambda o: jax.jit(lambda r: gx.design_observer(o.system, NOISE, r))(BOX),
+        "design_observer: `region`",
+        "traced",
+    ),
     "no number": (lambda o: NOISE.astype("int8"), "Interval.astype", "'int8'"),
     "margin NaN": (lambda o: BOX.contains([0, 0], margin=np.nan), "Interval.contains: `margin` is NaN"),
     "contains a box": (lambda o: BOX.contains(BOX), "Interval.contains: `value`", "type Interval"),
