@@ -129,7 +129,10 @@ def _order(method: str, order: Any) -> int:
         raise ValueError(f"discretize: `method` must be one of {', '.join(METHODS)}; got {method!r}")
     if not is_whole(order) or order < 1:
         raise ValueError(f"discretize: `order` must be an integer from 1 on, got {order!r}")
-    return {"euler": 1, "rk4": 4, "taylor": int(order), "zoh": 1}[method]
+    fixed = {"euler": 1, "rk4": 4, "zoh": 1}.get(method)
+    if fixed is not None and order not in (2, fixed):  # 2 is what it is where nobody gave one
+        raise ValueError(f'discretize: `order` = {order} is for method="taylor"; {method!r} has one of its own')
+    return int(order) if fixed is None else fixed
 
 
 def _sized(name: str, box: Any, size: int | None = None) -> int:

@@ -62,7 +62,7 @@ def discretize(
             anywhere within a step, where nothing is known of a nonlinear f.
         disturbance: box (n,) that w(t) stays in, units of the state per unit of time; zero if not given. Its centre
             becomes part of the discrete map.
-        order: of "taylor", from 1 on.
+        order: of "taylor", from 1 on; the other methods have their own.
         cells: number of equal parts into which every coordinate of the region is cut, or one number per coordinate: the
             bound is tighter, and takes as many times longer as there are parts.
         dtype: floating type in which the observer will run, whose rounding of the method's coefficients is part of the

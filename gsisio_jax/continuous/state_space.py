@@ -31,8 +31,8 @@ def from_state_space(
 
     Args:
         sys: a discrete ``control.StateSpace``, ``scipy.signal.dlti`` or ``StateSpace``; anything with A, B, C, D and
-            dt; or a tuple of matrices (A, B, C, D), which is discrete, or (A, B, C, D, dt). A continuous one needs
-            `dt`.
+            dt; or a tuple of matrices (A, B, C, D), which is discrete, or (A, B, C, D, period), with a period of 0 for
+            a continuous one. A continuous one needs `dt`.
         G: how the unknown input d enters the state, shape (n, p); zero if only H is given. For a continuous model: how
             it enters x'.
         H: how it enters the output, shape (l, p); zero if only G is given. With neither there is no unknown input.
@@ -47,8 +47,8 @@ def from_state_space(
         A `System`; its known inputs u, shape (m,), are those of the model that are not `unknown`.
 
     Raises:
-        ValueError: no state-space model; a continuous one without dt, or a discrete one with another; a shape does not
-            fit.
+        ValueError: no state-space model; a continuous one without dt, or a discrete one with another, or with any
+            where its period is not known; a shape does not fit; `options` hold what comes from the model.
 
     >>> plant = from_state_space(([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], [[1.0, 0.0]], [[0.0]]), unknown=[0])
     >>> plant.n, plant.m, plant.p
@@ -56,6 +56,9 @@ def from_state_space(
 
     Source: theory 1; zero-order hold: K. J. Astrom and B. Wittenmark, *Computer-Controlled Systems*, 1997, section 2.3.
     """
+    taken = [name for name in ("f", "g", "B", "D", "m") if name in options]
+    if taken:
+        raise ValueError(f"{_CALL}: `{taken[0]}` comes from the model; leave it out")
     (A, B, C, D), period = _read(sys)
     G, H = _unknown(G, H, len(A), len(C))
     columns = _columns(unknown, B.shape[1])
@@ -69,7 +72,13 @@ def from_state_space(
                 "gx.discretize"
             )
         A, B, G = _held(A, B, G, dt)
-    elif dt is not None and period is not True and dt != period:
+    elif dt is not None and period is True:
+        # Taken for discrete matrices as they are, those of a continuous model would make another plant, silently.
+        raise ValueError(
+            f"{_CALL}: `dt` is for a continuous model, and {_kind(sys)} is discrete; leave out dt, or give the "
+            "matrices of a continuous one as (A, B, C, D, 0) or scipy.signal.StateSpace(A, B, C, D)"
+        )
+    elif dt is not None and dt != period:
         raise ValueError(
             f"{_CALL}: the model is discrete already, with a period of {period:g}, not {dt:g}; leave out dt"
         )
@@ -104,6 +113,10 @@ def _read(sys: Any) -> tuple[list[np.ndarray], Any]:
     if period is not True and not (isinstance(period, int | float | np.number) and period >= 0):
         raise ValueError(f"{_CALL}: the period of a discrete model must be a positive number, or True; got {period!r}")
     return found, period
+
+
+def _kind(sys: Any) -> str:
+    return "a tuple of four matrices" if isinstance(sys, tuple | list) else f"a {type(sys).__name__} with dt = True"
 
 
 def _period(sys: Any) -> Any:

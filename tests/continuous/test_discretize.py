@@ -201,6 +201,10 @@ WRONG = {
     "own derivative": (lambda: gx.discretize(lambda x: _half(x), 0.1, region=ONE), "the derivative rule of `_half`"),
     "method": (lambda: gx.discretize(jnp.sin, 0.1, "heun", region=ONE), "must be one of euler, rk4, taylor, zoh"),
     "dt": (lambda: gx.discretize(jnp.sin, -0.1, region=ONE), "positive number"),
+    "order of another method": (
+        lambda: gx.discretize(jnp.sin, 0.1, "rk4", region=ONE, order=3),
+        'is for method="taylor"',
+    ),
     "order": (lambda: gx.discretize(jnp.sin, 0.1, region=ONE, order=0), "integer from 1 on"),
     "cells": (lambda: gx.discretize(jnp.sin, 0.1, region=ONE, cells=[2, 2]), "one for each of the 1 states"),
     "region": (lambda: gx.discretize(jnp.sin, 0.1, region=[0, 1]), "`region` must be a gsisio_jax.Interval"),

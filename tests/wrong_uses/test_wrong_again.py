@@ -122,6 +122,12 @@ MODELS = {
         "from_state_space: `sys`",
         "to_ss()",
     ),
+    "dt of a tuple": (
+        lambda o: gx.from_state_space((np.eye(2), np.ones((2, 1)), np.ones((1, 2)), np.zeros((1, 1))), dt=0.1),
+        "from_state_space: `dt` is for a continuous model",
+        "a tuple of four matrices is discrete",
+        "(A, B, C, D, 0)",
+    ),
     "no model": (lambda o: gx.from_state_space(None), "from_state_space: `sys`", "NoneType"),
     "one matrix": (lambda o: gx.from_state_space(np.eye(2)), "from_state_space: `sys`", "got ndarray"),
     "G of another model": (
