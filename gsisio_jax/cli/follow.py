@@ -163,7 +163,8 @@ def _check(options: argparse.Namespace, path: Path, part: TablePart) -> None:
 
 def _rows(tail: Tail, part: TablePart) -> Iterator[Any]:
     reader = TableReader(tail.name, part)
-    yield from map(reader.feed, tail)
+    for block in tail:
+        yield from reader.feed_up_to_fault(block)
     yield reader.finish()
 
 

@@ -66,10 +66,8 @@ class Tail:
                 text += "\n"
             cut = len(text) if ended else end_of_lines(text, parser.dialect.quote)
             if cut:
-                block = parser.parse(line, text[:cut])
+                yield from parser.parse_up_to_fault(line, text[:cut])
                 line += text.count("\n", 0, cut)
-                if len(block):
-                    yield block
             rest = text[cut:]
 
     def _parser(self, head: bytes, ended: bool) -> Parser | None:

@@ -89,6 +89,10 @@ def test_lines_are_the_boxes_of_the_table(project, monkeypatch):
         check([json.loads(line) for line in out.splitlines()], rows[:-1])
 
 
+GOOD = "t,pos,vel\n" + "".join(f"{k / 10},1,1\n" for k in range(20))
+
+
+@pytest.mark.parametrize("burst", [False, True])
 @pytest.mark.parametrize(
     ("text", "words", "steps"),
     [
@@ -97,16 +101,33 @@ def test_lines_are_the_boxes_of_the_table(project, monkeypatch):
         ("t,pos\n0,1\n0.1,1\n0.2,1\n", "standard input: there is no column 'vel'; the columns are: t, pos", 0),
         ("t,pos,vel\n", "standard input: the file has a header but no rows", 0),
         ("", "standard input: the file is empty", 0),
+        (f"{GOOD}2,oops,1\n2.1,1,1\n", "row 22, column 'pos': 'oops' is not a number", 20),
+        (f"{GOOD}2,1\n2.1,1,1\n", "row 22 has 2 cells, the header has 3", 20),
+        (f"{GOOD}2.5,1,\n2.53,1,1\n2.6,1,1\n", "row 23, column 't': the time 2.53 is not on the grid", 26),
+        ('t,pos,vel\n0,1,"1"\n0.1,1,1\n0.2,1,"oops"\n', "row 4, column 'vel': 'oops' is not a number", 2),
     ],
 )
-def test_faults_come_after_the_lines_before_them(project, monkeypatch, text, words, steps):
-    """What is read and when, without an observer."""
+def test_faults_come_after_the_lines_before_them(project, monkeypatch, text, words, steps, burst):
+    """What is read and when, without an observer; whether the lines come one by one or all at once."""
+    follow_without_observer(project, monkeypatch, [text] if burst else text.splitlines(keepends=True), words, steps)
+
+
+@pytest.mark.parametrize("burst", [False, True])
+def test_a_gap_in_known_inputs_comes_after_the_lines_before_it(project, monkeypatch, burst):
+    project.edit('y = ["pos", "vel"]', 'y = ["pos"]\nu = ["vel"]')
+    text = GOOD + "2.2,1,1\n"
+    words = "row 22: 2 rows of the grid are absent before it, so the known inputs (vel) are not known"
+    follow_without_observer(project, monkeypatch, [text] if burst else text.splitlines(keepends=True), words, 20)
+
+
+def follow_without_observer(project, monkeypatch, pieces, words, steps):
     blind = SimpleNamespace(
         rows=lambda tables: (table.time for table in tables), lines=lambda rows, begin: map(str, rows)
     )
     monkeypatch.setattr(follow, "Stepper", lambda *args: blind)
+    monkeypatch.setattr(follow, "build_problem", lambda *args: None)
     (project.folder / "cart.toml").write_text(project.config)
-    pipe(monkeypatch, *text.splitlines(keepends=True) or [""])
+    pipe(monkeypatch, *pieces or [""])
     code, out, err = project.run_main("estimate", str(project.folder / "cart.toml"), "-", "--follow")
     assert code == 2
     assert words in err.splitlines()[-1]

@@ -31,6 +31,10 @@ class Block:
     def __len__(self) -> int:
         return len(self.rows)
 
+    def cut(self, begin: int, end: int) -> Block:
+        """Rows `begin` to `end`."""
+        return Block(self.name, {name: cells[begin:end] for name, cells in self.columns.items()}, self.rows[begin:end])
+
     def row(self, index: int) -> str:
         """The beginning of a message about a row."""
         return f"{self.name}: row {self.rows[index]}"

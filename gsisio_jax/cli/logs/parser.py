@@ -19,7 +19,7 @@ from ..._extras import need
 from ..errors import UserError, reason
 from .cells import Block, Cells, check_columns
 from .dialect import Dialect, without_comments
-from .text import BLOCK, blocks_of_lines, opened
+from .text import BLOCK, blocks_of_lines, end_of_lines, opened
 
 _LINE_FEED, _SPACE, _TAB = b"\n \t"
 _NO_ROW = b"\x1a"  # in place of a comment: an empty line is an empty cell where there is one column
@@ -92,6 +92,22 @@ class Parser:
             if index not in self.as_text:
                 columns[one] = self.cells.numbers(block, one)
         return block
+
+    def parse_up_to_fault(self, line: int, text: str) -> Iterator[Block]:
+        """`parse`; where a row is at fault, first the rows before it, found by halving, and then the error."""
+        try:
+            block = self.parse(line, text)
+        except UserError:
+            middle = end_of_lines(text[: text.find("\n", len(text) // 2) + 1], self.dialect.quote)
+            if middle in (0, len(text)):  # the half may be the whole where its last line is long
+                middle = end_of_lines(text[: text.find("\n") + 1], self.dialect.quote)
+            if middle in (0, len(text)):
+                raise
+            yield from self.parse_up_to_fault(line, text[:middle])
+            yield from self.parse_up_to_fault(line + text.count("\n", 0, middle), text[middle:])
+            return
+        if len(block):
+            yield block
 
     def text(self, line: int, text: str) -> tuple[Any, np.ndarray]:
         """All columns of some whole lines as text, by position, and the numbers of the rows."""

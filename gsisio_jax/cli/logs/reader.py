@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,6 +75,25 @@ class TableReader:
             self._held = {key: values[cut:] for key, values in found.items()}
             found = {key: values[:cut] for key, values in found.items()}
         return self._emit(found, self._held["since"][0] if self._holds and len(self._held["since"]) else None)
+
+    def feed_up_to_fault(self, block: Block) -> Iterator[Rows]:
+        """`feed`; where a row is at fault, first the rows before it, found by halving, and then the error.
+
+        Fewer rows at a time must tell the same: not so of a sample time that the first block tells.
+        """
+        if len(block) < 2 or (self.part.sample_time == "auto" and self.clock is None):
+            yield self.feed(block)
+            return
+        before = {name: copy.deepcopy(value) for name, value in vars(self).items() if name != "part"}
+        try:
+            rows = self.feed(block)
+        except UserError:
+            vars(self).update(before)
+            middle = len(block) // 2
+            yield from self.feed_up_to_fault(block.cut(0, middle))
+            yield from self.feed_up_to_fault(block.cut(middle, len(block)))
+            return
+        yield rows
 
     def finish(self) -> Rows:
         """Rows that were held back, once there is no more block.
