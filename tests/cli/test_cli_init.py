@@ -126,6 +126,16 @@ def test_clocks(folder, header, stamps, found):
     assert (folder / "new" / table["file"]).samefile(folder / "log.csv")
 
 
+def test_units_below_the_header_are_no_missing_cells(folder):
+    (folder / "log.csv").write_text("time;T;heater\n;degC;\n0;0.5;0\n1;0.6;1\n2;0.7;0\n")
+    assert main(["init", "log.csv"]) == 0
+    text = (folder / "log.toml").read_text()
+    table = tomllib.loads(text)["table"]
+    assert table["sample_time"] == 1.0
+    assert "missing" not in table
+    assert "1 line of units" in text
+
+
 def test_parquet_and_what_cannot_be_read(folder, capsys):
     pandas = pytest.importorskip("pandas")
     frame = pandas.DataFrame({"t": [0.0, 0.1, 0.2], "speed [m/s]": [1.0, np.nan, 1.5], "n": [1, 2, 4]})

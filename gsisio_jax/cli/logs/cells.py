@@ -22,18 +22,21 @@ class Block:
         columns: for every wanted name (R,) floats with NaN where missing, or an object array or Series where the cells
             are no plain numbers (the clock; every column where `transform` comes after).
         rows: (R,) numbers of the rows: lines of a text file, else counted from 1.
+        units: what is to be said of the first row where it is the first one after a header: it may be one of units.
     """
 
     name: str
     columns: dict[str, Any]
     rows: np.ndarray
+    units: str = ""
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def cut(self, begin: int, end: int) -> Block:
         """Rows `begin` to `end`."""
-        return Block(self.name, {name: cells[begin:end] for name, cells in self.columns.items()}, self.rows[begin:end])
+        columns = {name: cells[begin:end] for name, cells in self.columns.items()}
+        return Block(self.name, columns, self.rows[begin:end], "" if begin else self.units)
 
     def row(self, index: int) -> str:
         """The beginning of a message about a row."""
@@ -104,7 +107,8 @@ class Cells:
         """
         values, bad = self.convert(block.columns[name])
         if bad is not None:
-            raise UserError(f"{block.row(bad)}, column '{name}': {self._complaint(block.columns[name], bad)}")
+            hint = "" if bad else block.units
+            raise UserError(f"{block.row(bad)}, column '{name}': {self._complaint(block.columns[name], bad)}{hint}")
         if np.isinf(values).any():
             bad = int(np.argmax(np.isinf(values)))
             raise UserError(

@@ -30,6 +30,7 @@ class Dialect:
         encoding, compression: of the file.
         columns: names, in order; ``c1, c2, ...`` where the file has no header.
         first_line: number of the first line that may be a row, counted from 1.
+        skip_after: lines of units after the header; None where the file has no header.
         found: what is not plain (commas, UTF-8, a header in line 1), in words; empty where all is plain.
         sample: cells of the first rows.
     """
@@ -43,6 +44,7 @@ class Dialect:
     compression: str
     columns: tuple[str, ...]
     first_line: int
+    skip_after: int | None
     found: str
     sample: tuple[tuple[str, ...], ...]
 
@@ -108,7 +110,7 @@ def sniff(
         raise UserError(f"{name}: {error}; set decimal or thousands in [table.dialect]") from error
     dialect = Dialect(
         layout.separator, decimal, thousands, comment, quote, encoding, compression, tuple(layout.columns), first + 1,
-        "", sample,
+        units if layout.header else None, "", sample,
     )  # fmt: skip
     return replace(dialect, found=_described(dialect, layout.header, units, bool(comment) and comment in text))
 

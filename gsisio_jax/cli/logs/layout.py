@@ -124,22 +124,27 @@ def _agreement(lines: list[str], layout: Layout, quote: str) -> tuple[float, flo
 
 
 def unit_rows(rows: list[list[str]], layout: Layout, wanted: Sequence[str], missing: Sequence) -> int:
-    """Lines after the header in which no wanted cell is a number or missing, at most three: units, descriptions."""
+    """Lines after the header in which no wanted cell is a number or missing, at most three: units, descriptions.
+
+    Some cells may be empty, as that of a clock without a unit, where no word of the line is in a later one: a row with
+    a sensor's "off" is a row of measurements.
+    """
     if not layout.header:
         return 0
     chosen = [layout.columns.index(name) for name in wanted if name in layout.columns] or range(len(layout.columns))
     words = {str(word).strip().lower() for word in missing} | numerals.MISSING
 
-    def speaks(cells: list[str]) -> bool:
+    def speaks(place: int, cells: list[str]) -> bool:
         if len(cells) != len(layout.columns):
             return False
-        looked = [cells[index] for index in chosen]
-        return (
-            any(looked)
-            and not any(cell[:1].isdigit() or numerals.is_number(cell) for cell in looked)
-            and not any(cell and cell.lower() in words for cell in looked)
+        said = {index: cells[index] for index in chosen if cells[index]}
+        if any(cell[:1].isdigit() or numerals.is_number(cell) or cell.lower() in words for cell in said.values()):
+            return False
+        later = (row for row in rows[place + 1 :] if len(row) == len(cells))
+        return bool(said) and (
+            len(said) == len(chosen) or not any(row[index] == cell for row in later for index, cell in said.items())
         )
 
-    count = next((index for index, cells in enumerate(rows[:3]) if not speaks(cells)), min(len(rows), 3))
+    count = next((place for place, cells in enumerate(rows[:3]) if not speaks(place, cells)), min(len(rows), 3))
     # A table of text alone has no units: what comes must be numbers.
     return count if count < len(rows) else 0

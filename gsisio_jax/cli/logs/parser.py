@@ -87,7 +87,7 @@ class Parser:
         if frame is None:
             frame = self._as_text(data, dict.fromkeys(self.wanted, object), rows)
         columns = {one: frame[index].to_numpy() for index, one in self.wanted.items()}
-        block = Block(self.name, columns, rows)
+        block = Block(self.name, columns, rows, self._units(line))
         for index, one in self.wanted.items():
             if index not in self.as_text:
                 columns[one] = self.cells.numbers(block, one)
@@ -114,6 +114,13 @@ class Parser:
         data, rows = self._rows(line, text)
         everything = dict.fromkeys(range(len(self.dialect.columns)), object)
         return self._as_text(data, everything, rows), rows
+
+    def _units(self, line: int) -> str:
+        """Of the lines that begin with this one: what may be wrong with their first row."""
+        known = self.dialect.skip_after
+        if known is None or line > self.dialect.first_line:
+            return ""
+        return f"; where this row is one of units: set table.dialect.skip_after = {known + 1}"
 
     def _rows(self, line: int, text: str) -> tuple[bytes, np.ndarray]:
         """The lines that are rows, and their numbers; comments and what comes before the first row are dropped."""

@@ -100,7 +100,7 @@ def joined(blocks: Iterator[Block]) -> Iterator[Block]:
         columns = {
             name: np.concatenate([np.asarray(block.columns[name]) for block in every]) for name in every[0].columns
         }
-        yield Block(every[0].name, columns, np.concatenate([block.rows for block in every]))
+        yield Block(every[0].name, columns, np.concatenate([block.rows for block in every]), every[0].units)
 
 
 def filled(found: list[Rows], notes: tuple[tuple[str, str], ...] = ()) -> Table:

@@ -137,21 +137,22 @@ class TableReader:
                 "time": index * self.part.sample_time,
             }
         stamps = self.stamps.read(block)
-        order = self._order(stamps)
+        order = self._order(stamps, block.units)
         if order is not None:
             stamps = stamps.take(order)
             found = {key: values[order] for key, values in found.items()}
         return found | {"index": self._points(stamps), "since": stamps.since, "time": stamps.time}
 
-    def _order(self, stamps: Stamps) -> np.ndarray | None:
+    def _order(self, stamps: Stamps, units: str) -> np.ndarray | None:
         """Rows that have a time, sorted on request; None where that is all of them as they are."""
         empty = np.isnan(stamps.since)
         order = None
         if empty.any():
             if self.part.on_blank_time == "error":
+                bad = int(np.argmax(empty))
                 raise UserError(
-                    f"{stamps.place(int(np.argmax(empty)))}: the time is missing; every row needs one, or set "
-                    'on_blank_time = "drop"'
+                    f"{stamps.place(bad)}: the time is missing; every row needs one, or set "
+                    f'on_blank_time = "drop"{"" if bad else units}'
                 )
             self.dropped += int(empty.sum())
             order = np.flatnonzero(~empty)

@@ -129,7 +129,7 @@ class StampReader:
                     break
             else:
                 return signed, np.zeros(len(signed), bool)
-        values = Cells(self.missing).numbers(Block(block.name, {name: column}, block.rows), name)
+        values = Cells(self.missing).numbers(Block(block.name, {name: column}, block.rows, block.units), name)
         return values, np.isnan(values)
 
     def _dates(self, column: Any, place: Callable[[int], str]) -> tuple[np.ndarray, np.ndarray]:

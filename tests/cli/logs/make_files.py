@@ -45,6 +45,8 @@ TEXTS = {
     "percent_comments.txt": "% t in s\n" + PLAIN.replace(",", "\t"),
     "preamble.csv": "Logger 7, firmware 2.1\nSerial number,12345\n\nStart,2024-05-01\n" + PLAIN,
     "units_row.csv": PLAIN.replace("t,a,b\n", "t,a,b\n[s],[m],[deg]\n"),
+    "units_row_without_first.csv": "t;a;b\n;m;deg\n" + SEMICOLON.partition("\n")[2],
+    "off_in_first_row.csv": "t;a;b\n;;off\n0;1,5;-2\n1;2,25;off\n",
     "units_and_types_rows.csv": SEMICOLON.replace("t;a;b\n", "t;a;b\ns;m;deg\nfloat;float;float\n"),
     "text_after_header.csv": PLAIN.replace("t,a,b\n", "t,a,b\nfirst run\n"),
     "no_header.csv": PLAIN.partition("\n")[2],

@@ -71,7 +71,19 @@ CASES = {
     "preamble.csv skip": record("header in line 5", dialect={"skip": 4}),
     "preamble.csv skip too few": refused("no column 't'; the columns are: Start, 2024-05-01", dialect={"skip": 3}),
     "units_row.csv": record("1 line of units"),
-    "units_row.csv kept": refused("row 2, column 't': '[s]' is not a number", dialect={"skip_after": 0}),
+    "units_row.csv kept": refused(
+        "row 2, column 't': '.s.' is not a number; .*; where this row is one of units: set table.dialect.skip_aft",
+        dialect={"skip_after": 0},
+    ),
+    "units_row_without_first.csv": record("semicolons between cells, decimal comma, 1 line of units"),
+    "units_row_without_first.csv as missing": refused(
+        "row 2, column 't': the time is missing; .*; where this row is one of units: set table.dialect.skip_after = 1",
+        missing=["m", "deg"],
+    ),
+    "units_row_without_first.csv skipped": record(
+        "semicolons between cells, decimal comma, 1 line of units", dialect={"skip_after": 1}, missing=["m", "deg"]
+    ),
+    "off_in_first_row.csv": refused("row 2, column 'b': 'off' is not a number; where it means missing: set"),
     "units_and_types_rows.csv": record("semicolons between cells, decimal comma, 2 lines of units"),
     "text_after_header.csv": refused("row 2 has 1 cell, the header has 3"),
     "no_header.csv": ({"time": "c1", "y": ["c2", "c3"]}, RECORD, "no header: columns c1, c2, ..."),
