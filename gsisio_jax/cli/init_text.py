@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from dataclasses import dataclass
 from typing import Any
 
 from .init_columns import Column
+from .logs.units import conversion
+
+DEGREES = {"deg": "rad", "°": "rad", "deg/s": "rad/s", "°/s": "rad/s"}
 
 
 @dataclass(frozen=True)
@@ -45,10 +49,15 @@ def configuration(file: str, name: str, dialect: str, rows: int, clock: Clocked 
         columns: the others.
     """
     used = measured(columns)
+    units = [(unit, DEGREES.get(unit, unit)) for _, unit in _labels(used)]
     outputs = ", ".join(
-        f"{{name = {_quoted(label)}{unit and f', unit = {_quoted(unit)}'}}}" for label, unit in _labels(used)
+        f"{{name = {_quoted(label)}{unit and f', unit = {_quoted(unit)}'}}}"
+        for (label, _), (_, unit) in zip(_labels(used), units, strict=True)
     )
-    radius = ", ".join(f"{(column.resolution or 0.0) / 2:.4g}" for column in used)
+    radius = ", ".join(
+        _not_below((column.resolution or 0.0) / 2 * (conversion(unit, to)[0] if unit != to else 1.0))
+        for column, (unit, to) in zip(used, units, strict=True)
+    )
     return f"""\
 # Written by gsisio init from the first {rows:,} rows of {name}.
 # Fill in what says FILL_IN, here and in plant.py, and take out of y, output and noise.v what you do not measure with.
@@ -67,8 +76,9 @@ output = [{outputs}]
 [noise]
 # What f leaves out in one step, at most, by state: {{radius = [0.01, 0.02]}}, or {{lower = [...], upper = [...]}}.
 w = "FILL_IN"
-# A SUGGESTION, and the least that is possible: half of the resolution of each column, as rounding costs that much. The
-# sensor itself errs by more: its data sheet says by how much. Bounds that are too small make false alarms.
+# A SUGGESTION, and the least that is possible: half of the resolution of each column (its last digit, or a coarser step
+# that all values lie on), as rounding costs that much. The sensor itself errs by more: its data sheet says by how much.
+# Bounds that are too small make false alarms.
 v = {{radius = [{radius}]}}
 
 [region]
@@ -86,7 +96,7 @@ file = {_quoted(file)}
 # Columns of numbers, in the order of y in plant.py. Known inputs go to u = [...]; then it is f(x, u) and
 # gx.System(..., m=1), and a table [u_region] with lower and upper holds the values that they can take.
 y = [{", ".join(_quoted(column.name) for column in used)}]
-# columns = {{{_quoted(used[0].name) if used else "level"} = {{unit = "mV"}}}}  # cells in mV, km/h, ... become V, m/s
+{_conversions(used, units)}
 {_missing(columns)}
 # What was found in the columns:
 {_columns(columns, used)}
@@ -191,6 +201,30 @@ def _clock(clock: Clocked | None) -> str:
     if clock.doubles:
         lines.append('on_duplicate = "first"            # some times are there twice; or "last", "mean"')
     return "\n".join(lines)
+
+
+def _not_below(value: float) -> str:
+    """Four digits, rounded up.
+
+    >>> _not_below(0.0005), _not_below(0.00872664), _not_below(0.0)
+    ('0.0005', '0.008727', '0')
+    """
+    text = f"{value:.4g}"
+    return text if float(text) >= value else f"{value + 10 ** (math.floor(math.log10(value)) - 3) / 2:.4g}"
+
+
+def _conversions(used: list[Column], units: list[tuple[str, str]]) -> str:
+    angles = [
+        f"{_quoted(column.name)} = {{unit = {_quoted(unit)}, to = {_quoted(to)}}}"
+        for column, (unit, to) in zip(used, units, strict=True)
+        if unit != to
+    ]
+    if not angles:
+        return f'# columns = {{{_quoted(used[0].name)} = {{unit = "mV"}}}}  # cells in mV, km/h, ... become V, m/s'
+    return (
+        "# Degrees become radians, which sin and cos take; noise.v and the units of output are in radians.\n"
+        f"columns = {{{', '.join(angles)}}}"
+    )
 
 
 def _missing(columns: list[Column]) -> str:

@@ -166,6 +166,44 @@ def test_numbers_that_stand_for_missing(values, sentinels):
     assert look_at("x", np.array(values), ".", "").sentinels == sentinels
 
 
+RNG = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize(
+    ("cells", "resolution"),
+    [
+        ([f"{value:.3f}" for value in RNG.uniform(-300, 300, 12)], 1e-3),  # seldom logged: no two are near
+        (["1.50", "0.00"] * 20, 1e-2),  # a switch
+        ([f"{0.5 * k:.2f}" for k in RNG.integers(0, 400, 60)], 0.5),  # half degrees, not all of them
+        ([f"{0.02 * k:.2f}" for k in range(10)], 1e-2),  # ten even digits are chance
+        ([f"{0.02 * k:.2f}" for k in range(60)], 0.02),
+        (["1.5e-3", "2e-3", "-1e-3"], 1e-4),
+        (["3", "8", "20"], 1.0),
+        (["1e3", "5e3", "2e4"], 1e3),
+        ([repr(float(0.00488281 * k)) for k in RNG.integers(0, 1000, 400)], 0.00488281),  # counts times a scale
+        (np.array([1, 5, 9]), 1.0),
+        (np.array([0.25, 8.0, np.nan]), 0.01),
+        (np.array([0.1, 8.0], np.float32), 0.1),
+    ],
+)
+def test_the_resolution_is_never_larger_than_the_digits_say(cells, resolution):
+    assert look_at("x", np.asarray(cells), ".", "").resolution == pytest.approx(resolution, rel=1e-5)
+
+
+def test_degrees_become_radians(folder):
+    lines = [f"{k};{0.5 * k:.1f};{k % 7};{k % 5}" for k in range(60)]
+    (folder / "log.csv").write_text("\n".join(["t;Gierrate [deg/s];head (°);v [km/h]", *lines]) + "\n", "utf-8")
+    assert main(["init", "log.csv"]) == 0
+    text = (folder / "log.toml").read_text("utf-8")
+    found = tomllib.loads(text)
+    assert found["table"]["columns"] == {
+        "Gierrate [deg/s]": {"unit": "deg/s", "to": "rad/s"},
+        "head (°)": {"unit": "°", "to": "rad"},
+    }
+    assert [one["unit"] for one in found["signals"]["output"]] == ["rad/s", "rad", "km/h"]
+    np.testing.assert_allclose(found["noise"]["v"]["radius"], [np.deg2rad(0.25), np.deg2rad(0.5), 0.5], rtol=1e-3)
+
+
 def test_the_mark_in_a_list(folder):
     (folder / "a.toml").write_text('[noise]\nw = {radius = [1, "FILL_IN"]}\n')
     with pytest.raises(UserError, match=re.escape("a.toml: fill in what says FILL_IN: noise.w.radius[1]")):
