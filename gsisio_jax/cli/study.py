@@ -41,7 +41,7 @@ Call = Callable[..., Any]
 def sweep(options: Namespace, path: Path, config: Config) -> int:
     """Run ``gsisio sweep``; returns the exit code."""
 
-    def plan(problem: Problem, folder: Path, file: str) -> tuple[SweepPart, int, Call]:
+    def plan(problem: Problem, folder: Path, file: str) -> tuple[SweepPart, int, float, Call]:
         part = config.sweep
         if part is None:
             raise UserError(f"{file}: sweep is missing; gsisio sweep --help shows a [sweep] table")
@@ -64,7 +64,7 @@ def sweep(options: Namespace, path: Path, config: Config) -> int:
             wanted = {"initial": initial, "y": records.y, "u": records.u, "length": records.length}
             return gx.sweep(observer, **wanted, time=records.time, **shared)
 
-        return part, records.steps, call
+        return part, records.steps, records.measured, call
 
     return _study(options, path, config, "sweep", plan)
 
@@ -72,7 +72,7 @@ def sweep(options: Namespace, path: Path, config: Config) -> int:
 def monte_carlo(options: Namespace, path: Path, config: Config) -> int:
     """Run ``gsisio monte-carlo``; returns the exit code."""
 
-    def plan(problem: Problem, folder: Path, file: str) -> tuple[MonteCarloPart, int, Call]:
+    def plan(problem: Problem, folder: Path, file: str) -> tuple[MonteCarloPart, int, float, Call]:
         part = config.monte_carlo
         if part is None:
             raise UserError(f"{file}: monte_carlo is missing; gsisio monte-carlo --help shows a [monte_carlo] table")
@@ -86,7 +86,7 @@ def monte_carlo(options: Namespace, path: Path, config: Config) -> int:
             except ContainmentLost as error:
                 raise ContainmentLost(f"{error} (here monte_carlo.seed is {part.seed})") from error
 
-        return part, part.steps, call
+        return part, part.steps, part.steps, call
 
     return _study(options, path, config, "monte_carlo", plan)
 
@@ -108,7 +108,7 @@ def _study(options: Namespace, path: Path, config: Config, kind: str, plan: Call
             with DelayedProgress(options.progress) as progress:
                 problem = build_problem(config, path.name)
                 progress.stage("reading the tables" if kind == "sweep" else "checking")
-                part, steps, call = plan(problem, path.parent, path.name)
+                part, steps, measured, call = plan(problem, path.parent, path.name)
                 shared = _shared(config, part, problem, title, f"{path.name}: {kind}")
                 progress.stage("designing")
                 began = time.perf_counter()
@@ -121,7 +121,7 @@ def _study(options: Namespace, path: Path, config: Config, kind: str, plan: Call
                 seconds = time.perf_counter() - began
             kept, _, known = before or (0, 0, 0)
             done = finished(store) or (0, 0, 0)
-            effort = Effort(design_seconds, seconds, steps, done[1], kept, done[2] - known)
+            effort = Effort(design_seconds, seconds, steps, measured, done[1], kept, done[2] - known)
             writers = {f"{stem}.nc": netcdf_writer(dataset, store)} | picture_writers(dataset, stem, part.picture)
             files = write_all(out, writers)
             summary = summarise(title, problem, observer.certificate, dataset, effort, [store, *files])

@@ -72,13 +72,17 @@ def initial_of(problem: Problem, axes: AxesPart, key: str) -> Any:
 
 @dataclass(frozen=True)
 class Records:
-    """What `sweep` is given of the measurements: with the axis "record" where files are listed."""
+    """What `sweep` is given of the measurements: with the axis "record" where files are listed.
+
+    `measured` of the `steps` have a measurement, on average over the records.
+    """
 
     y: Any
     u: Any
     length: Any
     time: np.ndarray | None
     steps: int
+    measured: float
 
 
 def read_records(wanted: TablePart, patterns: str | list[str] | None, folder: Path, file: str) -> Records:
@@ -96,19 +100,24 @@ def read_records(wanted: TablePart, patterns: str | list[str] | None, folder: Pa
 
     if patterns is None or (isinstance(patterns, str) and (folder / patterns).is_file()):
         table = read(folder / (patterns or wanted.file))
-        return Records(table.y, table.u, None, table.time, len(table.y))
+        return Records(table.y, table.u, None, table.time, len(table.y), _measured(table))
     paths = _matching([patterns] if isinstance(patterns, str) else patterns, folder, file)
     tables = [read(folder / path) for path in paths]
     lengths = np.array([len(table.y) for table in tables])
     steps = int(lengths.max())
     y = np.stack([np.pad(t.y, ((0, steps - len(t.y)), (0, 0)), constant_values=np.nan) for t in tables])
+    measured = sum(map(_measured, tables)) / len(tables)
     u = None
     if tables[0].u is not None:
         # Known inputs must be finite also in rows that do not count.
         u = grid(
             RECORD, np.stack([np.pad(t.u, ((0, steps - len(t.u)), (0, 0)), "edge") for t in tables if t.u is not None])
         )
-    return Records(grid(RECORD, y, coordinate=_labels(paths)), u, grid(RECORD, lengths), None, steps)
+    return Records(grid(RECORD, y, coordinate=_labels(paths)), u, grid(RECORD, lengths), None, steps, measured)
+
+
+def _measured(table: Table) -> int:
+    return int((~np.isnan(table.y)).any(axis=1).sum())
 
 
 def _matching(patterns: list[str], folder: Path, file: str) -> list[str]:

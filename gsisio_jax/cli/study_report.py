@@ -15,6 +15,7 @@ from ..plot.scales import quantiles
 from ..plot.study import with_entry
 from .problem import Names, Problem
 from .report import Summary, certificate_lines, short
+from .study_arguments import NOISE
 
 SHOWN = 5  # most elements of the axis of the noise
 WIDTHS = ("final", "mean", "max", "rms")
@@ -28,6 +29,7 @@ class Effort:
         design_seconds: of the design.
         seconds: of all tiles, the compilation included.
         steps: of each case.
+        measured: of them those with a measurement, on average over the cases.
         tiles: how many there are.
         kept: how many of them were there before.
         computed: cases that were computed now.
@@ -36,6 +38,7 @@ class Effort:
     design_seconds: float
     seconds: float
     steps: int
+    measured: float
     tiles: int
     kept: int
     computed: int
@@ -77,13 +80,37 @@ def _facts(dataset: Any, effort: Effort) -> list[tuple[str, ...]]:
         ("bounded", f"{_percent(1 - unbounded / cases)} of the cases at every step"),
         ("conflicts", f"{int(conflicts.sum()):,} steps in {int((conflicts > 0).sum()):,} cases"),
     ]
-    if hint := units_hint(int((conflicts > 0).sum()), cases):
+    if quiet := _quiet(dataset["conflicts"]):
+        facts.append(("no conflict", quiet))
+    if hint := _doubt(dataset["conflicts"], effort.measured):
         facts.append(("units?", hint))
     if outside:
         facts.append(("outside", f"{outside:,} cases leave the region at some step: no width is promised there"))
     if "missed" in dataset.attrs:
         facts.append(("misses", dataset.attrs["missed"]))
     return facts
+
+
+def _doubt(conflicts: Any, measured: float) -> str:
+    """What so many conflicts are a sign of: steps count, as of a single run, of the cases with the stated bounds or
+    larger ones, for a study of the noise is meant to find out below which of them conflicts begin."""
+    for noise in _noises(conflicts):
+        conflicts = conflicts.isel({noise: np.flatnonzero(conflicts[noise].values >= 1)})
+    return units_hint(int(conflicts.sum()), conflicts.size * measured)
+
+
+def _quiet(conflicts: Any) -> str:
+    """Where a study of the noise has conflicts at some scales: the smallest one without any."""
+    for noise in _noises(conflicts):
+        count = conflicts.sum([dim for dim in conflicts.dims if dim != noise])
+        quiet = conflicts[noise].values[count.values == 0]
+        if len(quiet) and count.values.any():
+            return f"smallest {noise.replace('_', ' ')} without one: {quiet.min():g}"
+    return ""
+
+
+def _noises(variable: Any) -> list[str]:
+    return [str(dim) for dim in variable.dims if dim in NOISE.values()]
 
 
 def _percent(share: float) -> str:

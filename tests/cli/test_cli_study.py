@@ -117,7 +117,7 @@ def test_median_worst_and_unbounded_of_the_summary(done, tmp_path):
     data = xarray.concat([data] * 2, "initial_scale", data_vars="minimal")
     data["state_width_final"].loc[{"state": "position"}] = np.array([[4.0], [1.0], [np.inf], [2.0]])
     data["state_width_final"].loc[{"state": "velocity"}] = np.array([[4.0], [1.0], [3.0], [2.0]])
-    effort = Effort(design_seconds=1.0, seconds=2.0, steps=STEPS, tiles=2, kept=1, computed=4)
+    effort = Effort(design_seconds=1.0, seconds=2.0, steps=STEPS, measured=STEPS, tiles=2, kept=1, computed=4)
     found = summarise("Cart", problem, done.observer.certificate, data, effort, [])
     assert [row[:5] for row in found.signals[:2]] == [
         ("position [m]", "1", "3", "unbounded", "25 %"),
@@ -125,6 +125,28 @@ def test_median_worst_and_unbounded_of_the_summary(done, tmp_path):
     ]
     assert ("tiles", "2, 1 of them from an earlier run") in found.facts
     assert ("run", f"2.00 s, {2 * STEPS} box-steps/s, compiling included") in found.facts
+
+
+@pytest.mark.parametrize(
+    ("conflicts", "scales", "hint", "quiet"),
+    [
+        ([3, 0, 0], [0.5, 1, 2], False, "smallest noise scale without one: 1"),  # a handful, below the stated bounds
+        ([STEPS, 5, 0], [0.25, 0.5, 1], False, "smallest noise scale without one: 1"),
+        ([3, 2, 1], [1, 2, 3], False, None),  # every case has some, but few steps
+        ([STEPS, STEPS - 1, 0], [1, 2, 1000], False, "smallest noise scale without one: 1000"),
+        ([STEPS, STEPS, STEPS], [0.5, 1, 2], True, None),
+        ([0, 0, 0], [0.5, 1, 2], False, None),
+        ([STEPS, STEPS, STEPS], [0.25, 0.5, 0.75], False, None),
+    ],
+)
+def test_conflicts_of_a_sweep_are_counted_by_steps(done, tmp_path, conflicts, scales, hint, quiet):
+    _, problem = problem_of(tmp_path)
+    data = done.dataset("cart_sweep.nc").assign_coords(noise_scale=scales)
+    data["conflicts"] = data["conflicts"].copy(data=np.broadcast_to(conflicts, data["conflicts"].shape))
+    effort = Effort(1.0, 2.0, steps=STEPS + 9, measured=STEPS, tiles=2, kept=1, computed=4)
+    facts = dict(summarise("Cart", problem, done.observer.certificate, data, effort, []).facts)
+    assert ("units?" in facts) is hint
+    assert facts.get("no conflict") == quiet
 
 
 def test_monte_carlo(done):
