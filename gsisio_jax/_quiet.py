@@ -14,9 +14,9 @@ from pathlib import PurePath
 
 
 def _is_command() -> bool:
-    """Is this process the command ``gsisio``, or ``python -m gsisio_jax.cli``?"""
+    """Is this process the command ``gsisio``, or ``python -m gsisio_jax`` (or ``gsisio_jax.cli``)?"""
     words = getattr(sys, "orig_argv", [])
-    module = len(words) > 2 and words[1:3] == ["-m", "gsisio_jax.cli"]
+    module = len(words) > 2 and words[1] == "-m" and words[2] in ("gsisio_jax", "gsisio_jax.cli")
     return module or (bool(sys.argv) and PurePath(sys.argv[0]).stem in ("gsisio", "gsisio-script"))
 
 

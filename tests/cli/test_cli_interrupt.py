@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from plot.studies import TIME
 
+import gsisio_jax
 from gsisio_jax import _quiet, dataset, plot
 from gsisio_jax.cli.labelled import measured_states
 from gsisio_jax.interval import Interval
@@ -45,6 +46,11 @@ def test_ctrl_c_during_imports_is_quiet(tmp_path, module):
     out, err = process.communicate(timeout=60)
     assert process.returncode == -signal.SIGINT
     assert (out, err) == ("", "")
+
+
+def test_the_package_is_the_command():
+    done = subprocess.run([sys.executable, "-m", "gsisio_jax", "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"gsisio {gsisio_jax.__version__}\n", "")
 
 
 def test_a_library_keeps_its_own_handler():
