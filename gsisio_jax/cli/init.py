@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import sys
 from dataclasses import replace
@@ -13,13 +14,12 @@ from .errors import UserError
 from .init_columns import Column, look_at
 from .init_text import Clocked, configuration, measured, plant
 from .logs.cells import Block
-from .logs.clock import Clock, find_sample_time
+from .logs.clock import TOLERANCE, Clock, find_sample_time, tolerance_needed
 from .logs.config import ClockPart, DialectPart
 from .logs.dialect import sniff_file
 from .logs.parquet import parquet_blocks, parquet_columns
 from .logs.parser import Parser
-from .logs.reader import TOLERANCE
-from .logs.stamps import StampReader, is_date_column
+from .logs.stamps import StampReader, Stamps, is_date_column
 from .logs.text import blocks_of_lines, is_parquet, opened
 from .output import check_writable, write_all
 
@@ -134,9 +134,16 @@ def _measured(clocked: Clocked, block: Block) -> Clocked:
     order = np.flatnonzero(~empty)[np.argsort(stamps.since[~empty], kind="stable")]
     stamps = stamps.take(order)
     try:
-        sample_time = find_sample_time(stamps)
-        clock = Clock(sample_time, TOLERANCE * sample_time, "s", found=True)
-        clock.place(stamps, duplicates=True)
+        return _on_grid(clocked, stamps, None)
     except UserError as error:
+        with contextlib.suppress(UserError):
+            if tolerance := tolerance_needed(stamps):
+                return _on_grid(clocked, stamps, tolerance)
         return replace(clocked, trouble=str(error))
-    return replace(clocked, sample_time=sample_time, description=clock.describe())
+
+
+def _on_grid(clocked: Clocked, stamps: Stamps, tolerance: float | None) -> Clocked:
+    sample_time = find_sample_time(stamps, tolerance)
+    clock = Clock(sample_time, TOLERANCE * sample_time if tolerance is None else tolerance, "s", found=True)
+    clock.place(stamps, duplicates=True)
+    return replace(clocked, sample_time=sample_time, tolerance=tolerance, description=clock.describe())

@@ -22,6 +22,7 @@ class Clocked:
         column, unit: as in ``time = {column, unit}``; no unit for dates and for seconds.
         dates: whether its cells are dates.
         sample_time: seconds; None where it could not be found, for the reason in `trouble`.
+        tolerance: seconds that stamps are off the grid, where that is more than usual.
         description: rows on the grid, gaps, jitter.
         blank, falls, doubles: cells are empty; times fall; times are there twice.
     """
@@ -30,6 +31,7 @@ class Clocked:
     unit: str | None
     dates: bool
     sample_time: float | None = None
+    tolerance: float | None = None
     description: str = ""
     trouble: str = ""
     blank: bool = False
@@ -185,6 +187,7 @@ def _clock(clock: Clocked | None) -> str:
             'sample_time = "FILL_IN"           # seconds'
         )
     unit = "" if clock.unit is None else f", unit = {_quoted(clock.unit)}"
+    unit += "" if clock.tolerance is None else f", tolerance = {clock.tolerance!r}"
     kind = "dates" if clock.dates else "seconds, as no unit is known" if clock.unit is None else f"unit: {clock.unit}"
     lines = [f"# Clock: {clock.column} ({kind}).", f"time = {{column = {_quoted(clock.column)}{unit}}}"]
     if clock.sample_time is None:

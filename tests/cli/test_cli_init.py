@@ -13,7 +13,7 @@ from gsisio_jax.cli import main
 from gsisio_jax.cli.config import read_config
 from gsisio_jax.cli.errors import UserError
 from gsisio_jax.cli.init_columns import look_at
-from gsisio_jax.cli.logs import read_table
+from gsisio_jax.cli.logs import TablePart, read_table
 from gsisio_jax.cli.problem import build_problem, importable
 
 
@@ -124,6 +124,18 @@ def test_clocks(folder, header, stamps, found):
     table = tomllib.loads((folder / "new" / "log.toml").read_text())["table"]
     assert found.items() <= table.items()
     assert (folder / "new" / table["file"]).samefile(folder / "log.csv")
+
+
+def test_a_jitter_beyond_the_usual_is_written_as_a_tolerance(folder):
+    times = 10 * np.arange(300) + np.random.default_rng(2).uniform(-1.5, 1.5, 300)
+    (folder / "log.csv").write_text("\n".join(["t_ms;x", *(f"{time:.3f};{k % 7}" for k, time in enumerate(times))]))
+    assert main(["init", "log.csv"]) == 0
+    table = tomllib.loads((folder / "log.toml").read_text())["table"]
+    filled = TablePart(**table)
+    assert table["time"].pop("tolerance") in (0.0015, 0.0016, 0.0017)
+    assert table["time"] == {"column": "t_ms", "unit": "ms"}
+    assert table["sample_time"] == pytest.approx(0.01, rel=1e-4)
+    assert len(read_table(folder / "log.csv", filled).y) == 300
 
 
 def test_units_below_the_header_are_no_missing_cells(folder):

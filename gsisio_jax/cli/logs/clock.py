@@ -19,6 +19,9 @@ from ..errors import UserError
 from .stamps import NAMES, Stamps, likely_unit
 
 MAXIMUM_STEPS = 50_000_000  # of one gap, and of a file that is read as a whole
+TOLERANCE = 0.1  # of the sample time
+SPARE = 1.1  # as later rows may be off by more
+CHANCE = 0.01  # that stamps on no grid are taken for some on one
 NEAR = 8  # steps between two rows that still tell how long a step is
 DRIFT = 2e-3  # how far the mean time between rows may be from sample_time: 0.0333 for 1/30 passes, 0.033 does not
 
@@ -217,7 +220,7 @@ def check_order(stamps: Stamps, step: np.ndarray, shown: str, duplicates: bool, 
     raise UserError(f"{stamps.place(bad)}: the time {stamps.show(bad)} {what}; {remedy}")
 
 
-def find_sample_time(stamps: Stamps) -> float:
+def find_sample_time(stamps: Stamps, tolerance: float | None = None) -> float:
     """The time between neighbouring rows, for ``sample_time = "auto"``.
 
     The median of the differences is within the jitter of a step, whatever gaps there are, as long as more than half of
@@ -225,9 +228,49 @@ def find_sample_time(stamps: Stamps) -> float:
     ends of a run cancels. Of the numbers that are as close as that, the one with the fewest digits is taken, as a
     frequency in Hz or as a time.
 
+    Args:
+        stamps: times of the rows.
+        tolerance: seconds that a stamp may be off its point; a tenth of the time between rows by default.
+
     Raises:
         UserError: fewer than three different times; or fewer than nine in ten rows fit the grid.
     """
+    mean, median, count, deviation = _even_steps(stamps)
+    good = (deviation <= 2 * (TOLERANCE * mean if tolerance is None else tolerance)) & (count > 0)
+    if good.mean() < 0.9:
+        wider = tolerance_needed(stamps)
+        remedy = f"set time.tolerance = {wider:g}, " if wider is not None else ""
+        raise UserError(
+            f'{stamps.place(0)}: sample_time = "auto" found steps of about {median:.4g} s, but only '
+            f"{good.mean():.0%} of the rows lie on such a grid; {remedy}give sample_time, or "
+            'dt = "as_input" where rows are uneven'
+        )
+    near = (count > 0) & (count <= NEAR)
+    runs = 1 + int(np.count_nonzero(~near))
+    jitter = float(deviation[good].max())
+    error = max(2 * jitter, 4 * stamps.resolution, 1e-12 * mean)
+    return rounded(mean, error * runs / float(count[near].sum()))
+
+
+def tolerance_needed(stamps: Stamps) -> float | None:
+    """Seconds that stamps are off their grid, rounded up; None where they are too far off to tell which point is whose,
+    or where stamps without a grid would often be as near to one.
+
+    Raises:
+        UserError: fewer than three different times.
+    """
+    mean, _, count, deviation = _even_steps(stamps)
+    needed = SPARE * float(deviation.max()) / 2
+    # Of stamps on no grid, differences are anywhere up to half a step off.
+    if needed <= 0 or (count > 0).mean() < 0.9 or (4 * needed / mean) ** len(count) > CHANCE:
+        return None
+    digit = 10.0 ** (math.floor(math.log10(needed)) - 1)
+    tolerance = float(f"{math.ceil(needed / digit) * digit:.2g}")
+    return tolerance if tolerance <= mean / 4 else None
+
+
+def _even_steps(stamps: Stamps) -> tuple[float, float, np.ndarray, np.ndarray]:
+    """Mean and median of the time between neighbours; steps from each time to the next, and how far off those are."""
     step = np.diff(np.sort(stamps.since))
     step = step[step > 0]
     if len(step) < 2:
@@ -239,19 +282,7 @@ def find_sample_time(stamps: Stamps) -> float:
         near = (count > 0) & (count <= NEAR)
         mean = float(step[near].sum() / count[near].sum())
     count = np.rint(step / mean)
-    near = (count > 0) & (count <= NEAR)
-    deviation = np.abs(step - count * mean)
-    good = (deviation <= 0.2 * mean) & (count > 0)
-    if good.mean() < 0.9:
-        raise UserError(
-            f'{stamps.place(0)}: sample_time = "auto" found steps of about {median:.4g} s, but only '
-            f"{good.mean():.0%} of the rows lie on such a grid; give sample_time, or "
-            'dt = "as_input" where rows are uneven'
-        )
-    runs = 1 + int(np.count_nonzero(~near))
-    jitter = float(deviation[good].max())
-    error = max(2 * jitter, 4 * stamps.resolution, 1e-12 * mean)
-    return rounded(mean, error * runs / float(count[near].sum()))
+    return mean, median, count, np.abs(step - count * mean)
 
 
 def rounded(value: float, error: float) -> float:

@@ -10,12 +10,11 @@ import numpy as np
 
 from ..errors import UserError
 from .cells import Block
-from .clock import Clock, check_order, find_sample_time
+from .clock import TOLERANCE, Clock, check_order, find_sample_time
 from .config import TablePart
 from .dialect import Dialect
 from .stamps import StampReader, Stamps
 
-TOLERANCE = 0.1  # of the sample time
 KNOWN = "every step needs one: fill it in with a table.transform, or make it an unknown input, a column of G"
 
 
@@ -184,7 +183,7 @@ class TableReader:
         assert part is not None
         assert reader is not None
         found = self.part.sample_time == "auto"
-        sample_time = find_sample_time(stamps) if found else self.part.sample_time
+        sample_time = find_sample_time(stamps, part.tolerance) if found else self.part.sample_time
         tolerance = TOLERANCE * sample_time if part.tolerance is None else part.tolerance
         if tolerance > sample_time / 4:
             raise UserError(

@@ -120,6 +120,24 @@ def test_the_sample_time_is_found(period, seed, origin):
     assert reader.clock.jitter <= 2.2 * JITTER * period
 
 
+def test_a_jitter_beyond_the_usual_is_told_as_a_tolerance():
+    rng = np.random.default_rng(5)
+    index = np.delete(np.arange(500), [100, 101])
+    values = 0.01 * index + rng.uniform(-0.0015, 0.0015, len(index))
+    with pytest.raises(UserError, match=r"only 8\d% .*; set time.tolerance = 0.001[5-8], give sample_time") as error:
+        read([block(values)], sample_time="auto")
+    told = float(str(error.value).partition("time.tolerance = ")[2].partition(",")[0])
+    table, reader = read([block(values)], sample_time="auto", time={"column": "t", "tolerance": told})
+    np.testing.assert_array_equal(points(table)[0], index)
+    assert reader.clock is not None
+    assert reader.clock.sample_time == pytest.approx(0.01, rel=1e-4)
+    # Rows on no grid, many or few, and such as could belong to either neighbour.
+    rare, near = [0, 1.3, 2.1, 3.4], np.arange(300) + rng.uniform(-0.3, 0.3, 300)
+    for uneven in (np.cumsum(rng.uniform(0.5, 1.5, 300)), rare, near):
+        with pytest.raises(UserError, match="on such a grid; give sample_time, or"):
+            read([block(np.asarray(uneven))], sample_time="auto")
+
+
 def test_an_even_clock_is_found_to_the_last_digit():
     for period in PERIODS:
         values = np.rint(period * np.arange(3000) * 1e6)  # whole microseconds
