@@ -14,6 +14,7 @@ import numpy as np
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax._extras import need
+from gsisio_jax._moments import zone_name
 from gsisio_jax._version import __version__
 from gsisio_jax.interval.reading import read_array
 from gsisio_jax.observer.status import flag_attributes
@@ -39,7 +40,8 @@ def to_dataset(
 
     Args:
         est: result of `estimate` on one record (no batch axis): T steps, n states, p unknown inputs.
-        time: shape (T,), seconds.
+        time: shape (T,), seconds; or dates, as a ``pandas.DatetimeIndex`` or ``datetime64`` of NumPy (of a zone: those
+            of UTC, as xarray knows none).
         dt: seconds between two steps, in the place of `time`: the first step is at 0 s. With neither, the time is the
             number of the step.
         state_names: n names; ``x1, x2, ...`` where left out. Likewise `input_names` (``d1, ...``) and `output_names`
@@ -126,12 +128,12 @@ def alarm_records(est: Any, time: Any, **labels: Any) -> list[dict[str, Any]]:
             `Alarm.describe`.
 
     Returns:
-        list[dict]: one for each alarm, with ``time``, ``step``, ``kind``, ``index``, ``gap`` (unit of the component)
-        and ``text``, a sentence.
+        list[dict]: one for each alarm, with ``time`` (a date as text of ISO 8601), ``step``, ``kind``, ``index``,
+            ``gap`` (unit of the component) and ``text``, a sentence.
     """
     return [
         {
-            "time": float(time[alarm.step]),
+            "time": _plain(time[alarm.step]),
             "step": int(alarm.step),
             "kind": str(alarm.kind),
             "index": int(alarm.index),
@@ -151,10 +153,28 @@ def _time(time: Any, dt: float | None, steps: int) -> tuple[np.ndarray, dict[str
         time = float(dt) * np.arange(steps)
     if time is None:
         return np.arange(steps, dtype=np.float64), {"long_name": "step"}
-    time = np.asarray(read_array("to_dataset", "time", time), dtype=np.float64)
+    dates = getattr(getattr(time, "dtype", None), "kind", "") == "M"
+    if dates:
+        zone = zone_of_dates(time)
+        attributes = {"long_name": "time"} | ({} if zone is None else {"zone": zone_name(zone)})
+        time = np.asarray(time, dtype="datetime64[ns]")  # of a zone: in UTC
+    else:
+        attributes = {"units": "s", "long_name": "time"}
+        time = np.asarray(read_array("to_dataset", "time", time), dtype=np.float64)
     if time.shape != (steps,):
         raise ValueError(f"to_dataset: `time` must have shape ({steps},), got {time.shape}")
-    return time, {"units": "s", "long_name": "time"}
+    if dates and np.isnat(time).any():
+        raise ValueError(f"to_dataset: `time` has no date in row {int(np.argmax(np.isnat(time)))}")
+    return time, attributes
+
+
+def zone_of_dates(time: Any) -> Any:
+    """The zone of dates of pandas, an index or a column; None where they have none."""
+    return getattr(getattr(time, "dt", time), "tz", None)
+
+
+def _plain(time: Any) -> float | str:
+    return str(np.datetime_as_string(time, unit="auto")) if isinstance(time, np.datetime64) else float(time)
 
 
 def _labels(

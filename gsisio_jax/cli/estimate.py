@@ -114,6 +114,7 @@ def _write(
 
     observer = outcome.observer
     totals = gather(outcome.boxes.parts(), problem, observer)
+    totals.zone = table.zone
     labelled = Labelled(problem, outcome.boxes, totals, title, observer.certificate)
     paths = {kind: out / name for kind, name in names.items()}
     summary = summarise(title, problem, totals, outcome, table.notes, paths.values())

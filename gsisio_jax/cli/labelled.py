@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .._moments import EPOCH
 from ..dataset import to_dataset
 from ..plot.style import MAXIMUM_POINTS, joined
 from ..plot.style import short as short_width
@@ -84,6 +85,10 @@ class Labelled:
         )
         for output, state in self._measured.items():
             dataset[f"measured_{problem.output.names[output]}"].attrs["measures"] = problem.state.names[state]
+        if self._totals.zone is not None:
+            # The numbers stay seconds; pictures show what they stand for.
+            dataset["time"].attrs |= {"long_name": "time since 1970-01-01 00:00 UTC", "epoch": EPOCH}
+            dataset["time"].attrs |= {"zone": self._totals.zone} if self._totals.zone else {}
         dataset.attrs["alarms"] = json.dumps(self._totals.alarms, ensure_ascii=False)
         if self._totals.alarm_count > len(self._totals.alarms):
             dataset.attrs["alarm_count"] = self._totals.alarm_count

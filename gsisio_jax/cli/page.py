@@ -10,7 +10,7 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from .._version import __version__
-from .report import Summary, seconds, short
+from .report import Summary, short, span
 from .totals import Totals
 
 SHOWN_ALARMS = 500
@@ -103,7 +103,7 @@ def write_page(
     verdict = "No alarm" if count == 0 else f"{count:,} certified alarm{'s' if count > 1 else ''}"
     head = (
         f"<h1>{escape(summary.title)}</h1>"
-        f'<p class="dim">{totals.steps:,} steps, {seconds(totals.first)} s to {seconds(totals.last)} s · '
+        f'<p class="dim">{totals.steps:,} steps, {span(totals)} · '
         f"gsisio_jax {__version__}</p>"
         f'<p class="verdict{" bad" if count else ""}">{verdict}</p>'
     )
@@ -139,7 +139,7 @@ def _alarms(totals: Totals) -> list[str]:
     shown = totals.alarms[:SHOWN_ALARMS]
     rows = [
         (
-            seconds(alarm["time"]),
+            totals.when(alarm["time"], unit=""),
             str(alarm["step"]),
             _SOURCES.get(alarm["kind"]) or str(alarm["kind"]),
             short(-alarm["gap"]),
@@ -147,11 +147,12 @@ def _alarms(totals: Totals) -> list[str]:
         )
         for alarm in shown
     ]
+    time = "time [s]" if totals.zone is None else "time"
     left = totals.alarm_count - len(shown)
     more = [f'<p class="dim">{left:,} more: every step with status 1 in the files is one.</p>'] if left else []
     return [
         '<p class="dim">Steps whose data contradict the stated bounds, whatever the unknown input was.</p>',
-        _table(("time [s]", "step", "source", "margin", "what contradicts what"), rows, words=True),
+        _table((time, "step", "source", "margin", "what contradicts what"), rows, words=True),
         *more,
     ]
 

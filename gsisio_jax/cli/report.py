@@ -41,10 +41,10 @@ def summarise(
     partly = f", and {totals.partly} with some entries missing" if totals.partly else ""
     estimated = totals.steps - outcome.resumed
     facts = [
-        ("steps", f"{totals.steps}, from {seconds(totals.first)} s to {seconds(totals.last)} s"),
+        ("steps", f"{totals.steps}, from {span(totals)}"),
         *notes,
         ("missing rows", f"{totals.absent}{partly}"),
-        ("conflicts", _conflicts(totals.alarm_times)),
+        ("conflicts", _conflicts(totals)),
         *([("units?", doubt(totals))] if doubt(totals) else []),
         ("unbounded", f"{totals.statuses['UNBOUNDED']} steps with a state that is not bounded"),
         *([("delay", _delay(outcome.boxes.delay))] if outcome.boxes.delay else []),
@@ -55,7 +55,7 @@ def summarise(
         ("run", f"{outcome.run_seconds:.3g} s, {estimated / max(outcome.run_seconds, 1e-9):,.0f} steps/s"),
     ]
     certificate = outcome.observer.certificate
-    alarms = [alarm_line(record) for record in totals.alarms[:SHOWN_ALARMS]]
+    alarms = [alarm_line(record, totals) for record in totals.alarms[:SHOWN_ALARMS]]
     if totals.alarm_count > SHOWN_ALARMS:
         alarms.append(f"... and {totals.alarm_count - SHOWN_ALARMS} more; every step with status 1 in the files is one")
     return Summary(
@@ -73,9 +73,15 @@ def _delay(steps: int) -> str:
     return f"boxes of a step are from measurements up to {steps} step{'s' if steps > 1 else ''} later"
 
 
-def alarm_line(record: dict[str, Any]) -> str:
+def span(totals: Totals) -> str:
+    """First and last time, and the zone of dates."""
+    zone = f" ({totals.zone})" if totals.zone else ""
+    return f"{totals.when(totals.first)} to {totals.when(totals.last)}{zone}"
+
+
+def alarm_line(record: dict[str, Any], totals: Totals) -> str:
     """One alarm as ``time: sentence``."""
-    return f"{seconds(record['time'])} s: {record['text']}"
+    return f"{totals.when(record['time'])}: {record['text']}"
 
 
 def doubt(totals: Totals) -> str:
@@ -106,11 +112,12 @@ def certificate_lines(certificate: Any, problem: Problem, found: Outside | None 
     return lines + [str(note) for note in certificate.notes]
 
 
-def _conflicts(times: np.ndarray) -> str:
+def _conflicts(totals: Totals) -> str:
+    times = totals.alarm_times
     if len(times) == 0:
         return "0"
-    shown = ", ".join(map(seconds, times[:SHOWN_TIMES]))
-    return f"{len(times)}, at {shown}{', ...' if len(times) > SHOWN_TIMES else ''} s"
+    shown = ", ".join(totals.when(time, unit="") for time in times[:SHOWN_TIMES])
+    return f"{len(times)}, at {shown}{', ...' if len(times) > SHOWN_TIMES else ''}{' s' if totals.zone is None else ''}"
 
 
 def _signals(totals: Totals, certificate: Any) -> list[Row]:
@@ -137,15 +144,6 @@ def promised(totals: Totals, certificate: Any) -> Iterator[tuple[Signal, float |
     inputs = ((width, None) for width in np.asarray(certificate.input_width))
     for signal, (width, room) in zip(totals.signals, (*states, *inputs), strict=True):
         yield (signal, float(width), room) if certificate.certified else (signal, None, None)
-
-
-def seconds(time: float) -> str:
-    """A time with the digits that tell steps apart, also where it counts from 1970, and without those of its rounding.
-
-    >>> seconds(0.1 + 0.2), seconds(1714557600.6)
-    ('0.3', '1714557600.6')
-    """
-    return f"{time:.10g}" if abs(time) < 1e6 else f"{time:.15g}"
 
 
 def short(value: float) -> str:

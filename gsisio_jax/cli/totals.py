@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from .._moments import moment
 from ..dataset import alarm_records
 from ..observer.alarms import read_alarms
 from ..observer.status import Status
@@ -16,6 +17,15 @@ from ..observer.summary import beyond, unpromised, unread
 from .problem import Names, Problem
 
 MOST_ALARMS = 10_000  # with their words; status and margin of the files have all
+
+
+def seconds(time: float) -> str:
+    """A time with the digits that tell steps apart, also where it counts from 1970, and without those of its rounding.
+
+    >>> seconds(0.1 + 0.2), seconds(1714557600.6)
+    ('0.3', '1714557600.6')
+    """
+    return f"{time:.10g}" if abs(time) < 1e6 else f"{time:.15g}"
 
 
 @dataclass
@@ -58,6 +68,8 @@ class Totals:
         beyond: steps whose state box is not inside the region.
         unread: steps of which an output, or one of the step before, is missing, ambiguous or contradicted.
         outside: these, and those with the status OUTSIDE_REGION.
+        zone: of the dates that the clock shows, "" where they have none; None where it counts from a beginning of its
+            own.
         alarms: the first `MOST_ALARMS` as plain data; `alarm_times` has the times of all, `alarm_count` of them.
     """
 
@@ -71,8 +83,13 @@ class Totals:
     beyond: int = 0
     unread: int = 0
     outside: int = 0
+    zone: str | None = None
     alarms: list[dict[str, Any]] = field(default_factory=list)
     alarm_times: np.ndarray = field(default_factory=lambda: np.empty(0))
+
+    def when(self, time: float, unit: str = " s") -> str:
+        """A time of the run for a reader: date and time of day where the clock shows dates, else seconds."""
+        return f"{seconds(time)}{unit}" if self.zone is None else moment(time, self.zone)
 
     @property
     def alarm_count(self) -> int:

@@ -83,8 +83,8 @@ class Estimate(eqx.Module):
         """The boxes as an ``xarray.Dataset`` over time, with names and units: `gsisio_jax.dataset.to_dataset`.
 
         Args:
-            labels: of `to_dataset`: ``time`` or ``dt`` [s], ``state_names``, ``input_names``, ``output_names``, units
-                likewise, the measurements ``y``, ``title``, ``certificate``.
+            labels: of `to_dataset`: ``time`` ([s], or dates) or ``dt`` [s], ``state_names``, ``input_names``,
+                ``output_names``, units likewise, the measurements ``y``, ``title``, ``certificate``.
         """
         from gsisio_jax.dataset import to_dataset
 
@@ -94,13 +94,18 @@ class Estimate(eqx.Module):
         """The boxes as a ``pandas.DataFrame``, one row a step: the variables of `to_xarray` as columns.
 
         Args:
-            labels: as in `to_xarray`; the index is the time in seconds, or the number of the step.
+            labels: as in `to_xarray`; the index is the time in seconds, the dates with their zone, or the number of the
+                step.
 
         Returns:
             Columns ``<signal>_lower``, ``<signal>_upper`` of every state and input, ``measured_<output>`` where ``y``
             is given, ``status`` and ``margin``.
         """
-        return self.to_xarray(**labels).to_dataframe()
+        from gsisio_jax.dataset import zone_of_dates
+
+        frame = self.to_xarray(**labels).to_dataframe()
+        zone = zone_of_dates(labels.get("time"))
+        return frame if zone is None else frame.tz_localize("UTC").tz_convert(zone)
 
 
 @named_arguments

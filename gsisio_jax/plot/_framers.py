@@ -11,6 +11,7 @@ import numpy as np
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval.reading import read_array
 from gsisio_jax.plot import style
+from gsisio_jax.plot.dates import show_dates
 from gsisio_jax.plot.record import Record, Series, read_record
 from gsisio_jax.plot.study import check_signals
 
@@ -60,6 +61,7 @@ def framers(
     for axis, name in zip(axes, names, strict=True):
         _panel(axis, record, every[name], None if truth is None else truth.get(name))
     for axis in axes:
+        show_dates(axis, record.time_label)
         if style.in_last_row(axis, axes):
             axis.set_xlabel(record.time_label)
     if figure is not None:

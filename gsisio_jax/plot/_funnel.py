@@ -10,6 +10,7 @@ import numpy as np
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.plot import style
 from gsisio_jax.plot._framers import true_rows
+from gsisio_jax.plot.dates import show_dates
 from gsisio_jax.plot.scales import quantiles
 from gsisio_jax.plot.tubes import Group, Tube, Tubes, read_tubes
 
@@ -61,6 +62,7 @@ def funnel(
             rows = true_rows("funnel", tube.name, truth[tube.name], len(tubes.time), tube.lower.shape[:-1])
         (group,) = tubes.groups(tube, 1, rows)
         _panel(axis, tubes, tube, group)
+        show_dates(axis, tubes.time_label)
         if style.in_last_row(axis, axes):
             axis.set_xlabel(tubes.time_label)
         if group.label and group.label not in title:

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.plot import style
+from gsisio_jax.plot.dates import show_dates
 from gsisio_jax.plot.scales import quantiles
 from gsisio_jax.plot.tubes import Group, Tube, Tubes, read_tubes
 
@@ -50,6 +51,7 @@ def widths(
     axes, figure = style.panels("widths", len(chosen), ax, style.stacked)
     for axis, tube in zip(axes, chosen, strict=True):
         _panel(axis, tubes, tube)
+        show_dates(axis, tubes.time_label)
         if style.in_last_row(axis, axes):
             axis.set_xlabel(tubes.time_label)
     if figure is not None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsisio_jax.observer.status import Status
+from gsisio_jax.plot.dates import days, zone_of
 from gsisio_jax.plot.study import KINDS, axes_of, fixed, kept_kinds, prepared, time_of, variable_signals
 
 
@@ -71,6 +72,8 @@ def _read_dataset(dataset: Any, call: str) -> Record:
         np.isnan(np.stack(list(outputs.values()))).all(axis=0) if outputs else _missing(variables["status"].values)
     )
     alarms = np.array([alarm["time"] for alarm in json.loads(dataset.attrs.get("alarms", "[]"))])
+    if zone_of(dataset) is not None:
+        alarms = days(alarms if alarms.dtype.kind == "f" else alarms.astype("M8[ns]"))
     time, label = time_of(dataset)
     nothing = np.full(len(time), np.nan)
     of_signals = list(measured.values())

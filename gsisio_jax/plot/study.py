@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsisio_jax.observer.status import Status
+from gsisio_jax.plot.dates import DateLabel, days, zone_of
 from gsisio_jax.plot.style import short
 
 KINDS = {"state": "x", "input": "d"}
@@ -92,7 +93,9 @@ def kept_kinds(dataset: Any) -> list[str]:
 
 
 def time_of(dataset: Any) -> tuple[np.ndarray, str]:
-    """Time of the rows and the label of its axis."""
+    """Time of the rows and the label of its axis; a `DateLabel` where they are dates."""
+    if (zone := zone_of(dataset)) is not None:
+        return days(dataset["time"].values), DateLabel(zone)
     unit = dataset["time"].attrs.get("units")
     return np.asarray(dataset["time"].values), f"time [{unit}]" if unit else "step"
 

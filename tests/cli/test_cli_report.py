@@ -8,6 +8,7 @@ import json
 import re
 from html.parser import HTMLParser
 
+import netCDF4
 import numpy as np
 import pytest
 
@@ -112,6 +113,41 @@ def test_report_and_json(project):
     assert "Cart &lt;i&gt;&amp;amp;&lt;/i&gt; &quot;cable&quot;" in text
     assert "<i>" not in text
     assert "1 certified alarm<" in text
+
+
+def test_a_log_with_dates_is_told_in_dates(project):
+    """In the zone of the log; numbers in the files stay seconds, and say what they count from."""
+    lines = (project.folder / "cart.csv").read_text().splitlines()
+    dated = [f"2024-03-31 01:59:{57 + float(line.partition(',')[0]):.1f}" for line in lines[1:]]
+    dated = [f"{date[:11]}03:00:0{float(date[17:]) - 60:.1f}" if float(date[17:]) >= 60 else date for date in dated]
+    rows = [f"{date},{line.partition(',')[2]}" for date, line in zip(dated, lines[1:], strict=True)]
+    project.write_table([lines[0], *rows])
+    project.edit('time = "t"', 'time = {column = "t", zone = "Europe/Berlin"}')
+    project.edit('picture = "cart.png"', 'picture = "cart.png"\nreport = "told.html"\ndraw = "dated_picture:draw"')
+    (project.folder / "dated_picture.py").write_text(DRAW)
+    code, out, err = project.run()
+    assert (code, err) == (0, "")
+    assert "steps         40, from 2024-03-31 01:59:57 to 2024-03-31 03:00:00.9 (Europe/Berlin)" in out
+    assert "conflicts     1, at 2024-03-31 01:59:59.5\n" in out
+    assert "    2024-03-31 01:59:59.5: velocity" in out
+    page = Page((project.out / "told.html").read_text())
+    assert next(row for row in page.rows if row[1:2] == [str(project.jump)])[0] == "2024-03-31 01:59:59.5"
+    assert "2024-03-31 01:59:57 to 2024-03-31 03:00:00.9 (Europe/Berlin)" in (project.out / "told.html").read_text()
+    with netCDF4.Dataset(project.out / "cart.nc") as file:
+        time = file["time"]
+        assert float(time[0]) == 1711846797.0
+        assert (time.units, time.epoch, time.zone) == ("s", "1970-01-01T00:00:00Z", "Europe/Berlin")
+        assert time.long_name == "time since 1970-01-01 00:00 UTC"
+    assert (project.out / "cart.png").read_text() == "time (Europe/Berlin)"
+
+
+DRAW = """
+import gsisio_jax as gx
+
+
+def draw(dataset, path):
+    path.write_text(gx.plot.framers(dataset)[-1].get_xlabel())
+"""
 
 
 def test_many_alarms_and_a_picture_that_browsers_do_not_show(tmp_path):

@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pandas as pd
 import pytest
 from files import plants
 
@@ -33,9 +34,27 @@ def test_a_table_of_an_estimate(boxes):
     np.testing.assert_array_equal(boxes.to_xarray(time=clock)["time"], clock)
 
 
+@pytest.mark.parametrize("zone", [None, "Europe/Berlin", "UTC"])
+def test_dates_are_taken_as_they_are(boxes, zone):
+    """Over the night in which clocks go back, with the zone of the index."""
+    index = pd.date_range("2024-10-27 00:00", periods=12, freq="15min", tz=zone)
+    for clock in (index, pd.Series(index)):
+        found = boxes.to_pandas(time=clock).index
+        assert (list(found), str(found.tz)) == (list(index), str(index.tz))
+        labelled = boxes.to_xarray(time=clock)
+        in_utc = index if zone is None else index.tz_convert("UTC").tz_localize(None)
+        np.testing.assert_array_equal(labelled["time"], in_utc)
+        assert labelled["time"].attrs.get("zone") == zone
+        assert "units" not in labelled["time"].attrs
+    plain = index.tz_localize(None) if zone is None else in_utc
+    np.testing.assert_array_equal(boxes.to_xarray(time=plain.to_numpy())["time"], plain)
+
+
 @pytest.mark.parametrize(
     ("labels", "words"),
     [
+        ({"time": pd.date_range("2024", periods=3)}, r"`time` must have shape \(12,\), got \(3,\)"),
+        ({"time": pd.DatetimeIndex([*pd.date_range("2024", periods=11), pd.NaT])}, "`time` has no date in row 11"),
         ({"dt": 0.1, "time": np.arange(12)}, "give either `time` or `dt`, got both"),
         ({"dt": 0.0}, "`dt` must be a number of seconds above 0, got 0.0"),
         ({"dt": "1 s"}, "`dt` must be a number of seconds above 0, got '1 s'"),

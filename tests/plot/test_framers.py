@@ -7,6 +7,7 @@ import subprocess
 import sys
 from types import SimpleNamespace
 
+import matplotlib.dates
 import numpy as np
 import pytest
 
@@ -57,6 +58,29 @@ def data(est):
 
 def texts(axes):
     return [axis.get_ylabel().replace("\n", " ") for axis in axes]
+
+
+@pytest.mark.parametrize("zone", ["", "Europe/Berlin", "+02:00"])
+def test_dates_at_the_axis(est, data, zone):
+    """From dates, and from seconds that say that they count from 1970; in the zone that is said."""
+    dates = np.datetime64("2024-05-01T10:00:00", "ns") + 500_000_000 * np.arange(STEPS)
+    dated = dataset.to_dataset(est, time=dates)
+    assert json.loads(dated.attrs["alarms"])[0]["time"] == "2024-05-01T10:00:10"
+    seconds = data.assign_coords(time=("time", 1714557600 + 0.5 * np.arange(STEPS), {"units": "s", "epoch": "1970"}))
+    seconds.attrs["alarms"] = json.dumps([{"time": 1714557610.0}])
+    for source in (dated, seconds):
+        if zone:
+            source["time"].attrs["zone"] = zone
+        axis = plot.framers(source)[-1]
+        axis.figure.canvas.draw()
+        assert axis.get_xlabel() == (f"time ({zone})" if zone else "time")
+        shown = axis.xaxis.get_major_formatter().format_ticks(axis.get_xticks())
+        assert f"{12 if zone else 10}:00" in shown
+        (alarm,) = (line for line in axis.lines if line.get_label() == "certified alarm")
+        found = matplotlib.dates.num2date(alarm.get_xdata()[0]).timestamp()
+        assert found == pytest.approx(1714557610, abs=1e-3)
+        axis = plot.widths(source)[-1]
+        assert axis.get_xlabel() == (f"time ({zone})" if zone else "time")
 
 
 def test_a_dataset_needs_no_arguments(data):

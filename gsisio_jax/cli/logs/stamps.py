@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..._extras import need
+from ..._moments import zone_name
 from ..errors import UserError
 from .cells import Block, Cells
 from .config import ClockPart
@@ -60,6 +61,8 @@ class StampReader:
         part: column, unit or format, zone.
         dates: whether the cells are dates and not numbers.
         unit: of numbers; for ``unit = "epoch"`` found by the size of the first one.
+        zone: of the dates that the clock shows or stands for, "" where they have none; None where it counts from a
+            beginning of its own.
         origin: the first stamp, in that unit or in nanoseconds since 1970, once there was one. With it a reader that is
             made anew goes on where another one was.
     """
@@ -68,6 +71,7 @@ class StampReader:
     missing: Sequence[float | str] = ()
     dates: bool = False
     unit: str = "s"
+    zone: str | None = None
     origin: int | float | None = None
 
     def __post_init__(self) -> None:
@@ -96,6 +100,7 @@ class StampReader:
             if self.part.unit == "epoch" and self.origin is None and not empty.all():
                 self.unit = _epoch_unit(float(values[~empty][0]), place(int(np.argmin(empty))))
             scale = PER_SECOND[self.unit]
+            self.zone = "UTC" if self.part.unit == "epoch" else None
         if self.origin is None and not empty.all():
             self.origin = values[~empty][0].item()
         since = (values - (self.origin or 0)) / scale
@@ -139,7 +144,8 @@ class StampReader:
         kind = getattr(series.dtype, "kind", "O")
         empty = series.isna().to_numpy(dtype=bool)
         if kind == "M":
-            found, aware = series, getattr(series.dt, "tz", None) is not None
+            aware = getattr(series.dt, "tz", None) is not None
+            found, own = series, zone_name(series.dt.tz) if aware else ""
         else:
             text = series.astype(object).where(~empty, "").map(lambda cell: str(cell).strip())
             words = {word for word in self.missing if isinstance(word, str)}
@@ -147,6 +153,9 @@ class StampReader:
                 lambda cell: cell in words or cell.lower() in ("", "nan", "nat", "null", "na", "n/a")
             ).to_numpy(dtype=bool)
             found, aware = self._parsed(text, empty, place, pandas)
+            own = _offset(text[~empty].iloc[0]) if aware and not empty.all() else ""
+        if self.zone is None and _has_date(self.part.format):
+            self.zone = self.part.zone or own
         if not aware:
             found = self._in_zone(found, empty, place)
         nanoseconds = (
@@ -189,6 +198,17 @@ class StampReader:
                 "are set that night; log in UTC or with an offset such as +02:00"
             )
         return local
+
+
+def _offset(cell: str) -> str:
+    """The offset from UTC that a date ends with."""
+    found = re.search(r"[+-]\d\d:?\d\d$|[+-]\d\d$", cell)
+    return found[0] if found and _OFFSET.search(cell) else "UTC"
+
+
+def _has_date(pattern: str | None) -> bool:
+    """Whether a pattern has a day, not only a time of day."""
+    return pattern is None or re.search("%[-#]?[djDFcxs]", pattern) is not None
 
 
 def is_date_column(column: Any) -> bool:

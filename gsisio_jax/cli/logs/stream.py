@@ -44,6 +44,11 @@ class TableStream:
         """What was found and is not plain, once all has been read."""
         return self._reader.notes(self._dialect)
 
+    @property
+    def zone(self) -> str | None:
+        """As of `StampReader`, once a row has been read."""
+        return None if self._reader.stamps is None else self._reader.stamps.zone
+
     def _rows(self) -> Iterator[Rows]:
         yield from map(self._reader.feed, self._blocks)
         yield self._reader.finish()

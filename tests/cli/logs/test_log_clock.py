@@ -189,6 +189,25 @@ def test_the_unit_of_an_epoch_is_told_by_its_size(unit, second):
     np.testing.assert_array_equal(table.time, 1_714_557_600 + np.arange(4))
 
 
+@pytest.mark.parametrize(
+    ("stamps", "time", "zone"),
+    [
+        (["2024-05-01T10:00:00", "2024-05-01T10:00:01"], {}, ""),
+        (["2024-05-01T10:00:00", "2024-05-01T10:00:01"], {"zone": "Europe/Berlin"}, "Europe/Berlin"),
+        (["2024-05-01T10:00:00Z", "2024-05-01T10:00:01Z"], {}, "UTC"),
+        (["2024-05-01T10:00:00+02:00", "2024-05-01T10:00:01+02:00"], {}, "+02:00"),
+        (["01.05.2024 10:00:00", "01.05.2024 10:00:01"], {"format": "%d.%m.%Y %H:%M:%S"}, ""),
+        (["10:00:00", "10:00:01"], {"format": "%H:%M:%S"}, None),
+        ([1714557600, 1714557601], {"unit": "epoch"}, "UTC"),
+        ([1714557600, 1714557601], {}, None),
+    ],
+)
+def test_the_zone_of_dates(stamps, time, zone):
+    _, reader = read([block(np.array(stamps, dtype=object))], sample_time=1.0, time={"column": "t"} | time)
+    assert reader.stamps is not None
+    assert reader.stamps.zone == zone
+
+
 def test_a_clock_goes_on_where_a_copy_of_it_was():
     from dataclasses import asdict
 
