@@ -52,7 +52,6 @@ def estimate(options: argparse.Namespace, path: Path, config: Config, wanted: Ta
         transform = wanted.transform and resolve(wanted.transform, f"{path.name}: table.transform")
         draw = _draw(config.outputs, path.name)
         problem = build_problem(config, path.name)
-        progress.stage("reading the table")
         table = TableStream(source, wanted, transform or None)
         try:
             outcome = run(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from ..observer.estimation import OnConflict
 from ..observer.summary import beyond
+from . import boxes as storage
 from .boxes import Boxes, record_type
 from .checkpoint import Checkpoint, Digest, identity, refused
 from .logs import Table
@@ -57,7 +59,7 @@ def run(
     resume: bool = False,
     total: int | None = None,
 ) -> Outcome:
-    """Design the observer and estimate every step of a table.
+    """Read the beginning of a table, design the observer and estimate every step.
 
     The numbers are those of `gsisio_jax.estimate` on the whole table. Every chunk has the same length, so there is one
     compilation: one that is not full is filled up with missing rows whose results are dropped.
@@ -76,6 +78,10 @@ def run(
         UserError: the checkpoint is that of another run, or whatever reading the blocks raises.
     """
     clock = time.perf_counter
+    progress.stage("reading the table")
+    began = clock()
+    blocks = read_ahead(blocks, storage.IN_MEMORY)
+    reading_seconds = clock() - began
     progress.stage("designing")
     began = clock()
     observer = design(problem, progress=False)
@@ -98,7 +104,7 @@ def run(
     except BaseException:
         boxes.close()
         raise
-    seconds = clock() - began - runner.compile_seconds
+    seconds = reading_seconds + clock() - began - runner.compile_seconds
     return Outcome(observer, boxes, design_seconds, runner.compile_seconds, seconds, runner.resumed, runner.u_outside)
 
 
@@ -191,6 +197,28 @@ class _Runner:
 
     def _save(self, checkpoint: Checkpoint) -> None:
         checkpoint.save(self.boxes, self.carry, self.identity, self.digest)
+
+
+def read_ahead(blocks: Iterable[Table], limit: int) -> Iterator[Table]:
+    """The same blocks; as many of the first ones as have more than `limit` rows are read at once.
+
+    So what is wrong with a table that is not long is said before the observer is designed.
+    """
+    rest = iter(blocks)
+    first: deque[Table] = deque()
+    rows = 0
+    for block in rest:
+        first.append(block)
+        rows += len(block.time)
+        if rows > limit:
+            break
+
+    def every() -> Iterator[Table]:
+        while first:
+            yield first.popleft()
+        yield from rest
+
+    return every()
 
 
 def chunks(blocks: Iterable[Table], size: int) -> Iterator[Table]:

@@ -92,6 +92,22 @@ def test_resume_refuses_another_run(project, short_memory, monkeypatch):
     assert {path.name: path.read_bytes() for path in (project.out / ".cart.part").iterdir()} == kept
 
 
+def test_a_bad_cell_is_told_before_the_design(project, monkeypatch):
+    """Without any observer; but for one beyond the rows that are read before."""
+
+    def designed(*_, **__):
+        raise ValueError("designed")
+
+    monkeypatch.setattr("gsisio_jax.cli.run.design", designed)
+    monkeypatch.setattr(parser.text_blocks, "__defaults__", ((), 300))
+    lines = (project.folder / "cart.csv").read_text().splitlines()
+    lines[35] = lines[35].replace(",fine", "x,fine")
+    project.write_table(lines)
+    project.refused("cart.csv: row 36, column 'vel': ")
+    monkeypatch.setattr(boxes, "IN_MEMORY", 1)
+    project.refused("designed")
+
+
 def test_a_bad_cell_far_down_keeps_what_comes_before(project, short_memory, monkeypatch):
     monkeypatch.setattr(parser.text_blocks, "__defaults__", ((), 300))
     lines = (project.folder / "cart.csv").read_text().splitlines()
