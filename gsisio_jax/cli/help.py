@@ -65,6 +65,7 @@ The table [table] says how the log is written; docs/logs.md explains every key:
   columns = {speed = {unit = "km/h"}}  # to SI; also to = "m/s", scale = 0.1, offset = -40
   on_duplicate = "mean"              # or first, last; on_unsorted = "sort", on_blank_time = "drop";
                                      # left out: such rows are errors
+  on_gap_u = "hold"                  # known inputs keep their last value where a step or a cell has none
   sparse = true                      # most steps have no row, and that is meant
   transform = "plant:clean"          # a function of the pandas.DataFrame, before all else
   [table.dialect]                    # what is not found by looking: separator, decimal, thousands, comment,

@@ -120,6 +120,11 @@ def test_a_gap_in_known_inputs_comes_after_the_lines_before_it(project, monkeypa
     follow_without_observer(project, monkeypatch, [text] if burst else text.splitlines(keepends=True), words, 20)
 
 
+def test_known_inputs_are_held_while_following(project, monkeypatch):
+    project.edit('y = ["pos", "vel"]', 'y = ["pos"]\nu = ["vel"]\non_gap_u = "hold"')
+    follow_without_observer(project, monkeypatch, [f"{GOOD}2.2,1,1\n2.3,1,\noops\n"], "row 24 has 1 cell", 24)
+
+
 def follow_without_observer(project, monkeypatch, pieces, words, steps):
     blind = SimpleNamespace(
         rows=lambda tables: (table.time for table in tables), lines=lambda rows, begin: map(str, rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -9,7 +10,10 @@ import pandas as pd
 import pytest
 
 from gsisio_jax.cli.errors import UserError
-from gsisio_jax.cli.logs import TablePart, read_table
+from gsisio_jax.cli.logs import TablePart, TableReader, read_table
+from gsisio_jax.cli.logs.cells import Block
+from gsisio_jax.cli.logs.read import filled
+from gsisio_jax.cli.logs.stream import on_grid
 
 GOOD = ["t,a,b,word", "0,1,2,x", "1,1.5,,y", "3,-9999, 4e0 ,z"]
 
@@ -125,6 +129,41 @@ def test_known_inputs(tmp_path):
         read(tmp_path, ["t,a,b", "0,1,2", "1,1,"], y=["a"], u=["b"])
     with pytest.raises(UserError, match=r"row 3: 2 rows of the grid are absent before it, .*\(b\).*column of G"):
         read(tmp_path, ["t,a,b", "0,1,2", "3,1,3"], y=["a"], u=["b"])
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("how", ["last", "error"])
+def test_known_inputs_are_held_over_gaps(seed, how):
+    """As pandas fills forward on the whole grid; in blocks of any size, also where rows are held back."""
+    rng = np.random.default_rng(seed)
+    index = np.cumsum(rng.choice([1, 1, 2, 5], 40)) - 1
+    index -= index[0]
+    values = rng.normal(size=(40, 2))
+    values[rng.random((40, 2)) < 0.3] = np.nan
+    values[0] = 1.0
+    columns = {"t": index.astype(float), "a": np.arange(40.0), "b": values[:, 0], "c": values[:, 1]}
+    cuts = [0, *np.sort(rng.integers(0, 40, 4)), 40]
+    part = TablePart(
+        file="log", time="t", sample_time=1.0, y=["a"], u=["b", "c"], on_gap_u="hold", on_duplicate=how, sparse=True
+    )
+    whole = Block("log", columns, np.arange(40) + 2)
+    blocks = [whole.cut(begin, end) for begin, end in itertools.pairwise(cuts)]
+    wanted = pd.DataFrame(values, index).reindex(np.arange(index[-1] + 1)).ffill()
+    reader = TableReader("log", part)
+    rows = [*map(reader.feed, blocks), reader.finish()]
+    np.testing.assert_array_equal(filled(rows).u, wanted)
+    pieces = list(on_grid(rows))
+    assert all(len(piece.u) == len(piece.time) for piece in pieces if piece.u is not None)
+    np.testing.assert_array_equal(np.concatenate([piece.u for piece in pieces if piece.u is not None]), wanted)
+    lost = np.isnan(pd.DataFrame(values, index).reindex(wanted.index)).any(axis=1).sum()
+    assert f"known inputs held at {lost} steps without a value" in dict(reader.notes(None))["clock"]
+
+
+def test_inputs_that_cannot_be_held(tmp_path):
+    with pytest.raises(UserError, match=r"row 2, column 'b': a known input is missing, and there is none before it"):
+        read(tmp_path, ["t,a,b", "0,1,", "1,1,2"], y=["a"], u=["b"], on_gap_u="hold")
+    with pytest.raises(ValueError, match="is for known inputs, and u is empty"):
+        TablePart(file="log", sample_time=1.0, y=["a"], on_gap_u="hold")
 
 
 def test_transform_sees_numbers_and_its_result_is_used(tmp_path):

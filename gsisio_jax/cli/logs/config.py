@@ -152,6 +152,7 @@ class TablePart(Part):
     on_duplicate: Literal["error", "first", "last", "mean"] = "error"
     on_unsorted: Literal["error", "sort"] = "error"
     on_blank_time: Literal["error", "drop"] = "error"
+    on_gap_u: Literal["error", "hold"] = "error"
     sparse: bool = False
 
     @field_validator("sample_time", mode="after")
@@ -169,6 +170,8 @@ class TablePart(Part):
             raise ValueError('sample_time = "auto" needs time, the column that it is found in; give a number instead')
         if self.dt is not None and self.sample_time is not None:
             raise ValueError('give either sample_time or dt = "as_input", not both: its rows lie on no grid')
+        if self.on_gap_u == "hold" and not self.u:
+            raise ValueError('on_gap_u = "hold" is for known inputs, and u is empty')
         tolerance = None if self.time is None else self.time.tolerance
         if tolerance is not None and self.dt is not None:
             raise ValueError('time.tolerance has no meaning with dt = "as_input": its rows lie on no grid')

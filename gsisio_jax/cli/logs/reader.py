@@ -15,7 +15,10 @@ from .config import TablePart
 from .dialect import Dialect
 from .stamps import StampReader, Stamps
 
-KNOWN = "every step needs one: fill it in with a table.transform, or make it an unknown input, a column of G"
+KNOWN = (
+    'every step needs one: set on_gap_u = "hold" where it kept its last value, fill it in with a table.transform, or '
+    "make it an unknown input, a column of G"
+)
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Rows:
         index: (R,) points of the grid, rising.
         time: (R,) seconds.
         y: (R, l).
-        u: (R, m) or None.
+        u: (R, m), or a row for every point of the grid since the last row before; None where there are no inputs.
         rows: (R,) numbers of the rows in the file.
     """
 
@@ -54,9 +57,10 @@ class TableReader:
         self.name, self.part = name, part
         self.stamps = None if part.time is None else StampReader(part.time, tuple(part.missing))
         self.clock: Clock | None = None
-        self.dropped = self.merged = 0
+        self.dropped = self.merged = self.filled = 0
         self.sorted = False
         self._held: dict[str, np.ndarray] = {}
+        self._last_u = np.full(len(part.u), np.nan)
         self._last, self._since, self._shown, self._step = -1, 0.0, "", 0.0
         self._holds = part.dt is not None or part.on_duplicate in ("last", "mean")
 
@@ -116,6 +120,7 @@ class TableReader:
             f"{self.dropped:,} rows without a time dropped" if self.dropped else "",
             f"{self.merged:,} rows of the same step merged ({self.part.on_duplicate})" if self.merged else "",
             "rows sorted" if self.sorted else "",
+            f"known inputs held at {self.filled:,} steps without a value" if self.filled else "",
         ]
         notes = [("table", dialect.found)] if dialect is not None and dialect.found else []
         uneven = clock is not None and clock.jitter > 0.01 * clock.sample_time
@@ -218,7 +223,8 @@ class TableReader:
         if not len(index):
             return Rows(index, found["time"], found["y"], u if self.part.u or self.part.dt else None, found["rows"])
         if self.part.u:
-            self._check_inputs(found)
+            u = self._held_inputs(found) if self.part.on_gap_u == "hold" else u
+            self._check_inputs(found, u)
         if self.part.dt is not None:
             u = np.column_stack([u, self._time_steps(found["since"], following)])
         self._last = int(index[-1])
@@ -234,17 +240,30 @@ class TableReader:
         self._step = float(step[-1])
         return step
 
-    def _check_inputs(self, found: dict[str, np.ndarray]) -> None:
+    def _held_inputs(self, found: dict[str, np.ndarray]) -> np.ndarray:
+        """Known inputs at every point of the grid since the last row before: where there is none, the last one."""
+        begin = self._last + 1
+        u = np.full((int(found["index"][-1]) - self._last, len(self.part.u)), np.nan)
+        u[found["index"] - begin] = found["u"]
+        self.filled += int(np.isnan(u).any(axis=1).sum())
+        u = np.vstack([self._last_u, u])
+        source = np.where(np.isnan(u), 0, np.arange(len(u))[:, None])
+        u = np.take_along_axis(u, np.maximum.accumulate(source), axis=0)
+        self._last_u = u[-1]
+        return u[1:]
+
+    def _check_inputs(self, found: dict[str, np.ndarray], u: np.ndarray) -> None:
         """Known inputs must be there at every step."""
-        blank = np.isnan(found["u"])
+        held = self.part.on_gap_u == "hold"
+        blank = np.isnan(u[found["index"] - self._last - 1] if held else u)
         if blank.any():
             row, column = np.unravel_index(int(np.argmax(blank)), blank.shape)
             raise UserError(
-                f"{self.name}: row {found['rows'][row]}, column '{self.part.u[column]}': a known input is missing; "
-                + KNOWN
+                f"{self.name}: row {found['rows'][row]}, column '{self.part.u[column]}': a known input is missing"
+                + (", and there is none before it to be held" if held else f"; {KNOWN}")
             )
         absent = np.diff(found["index"], prepend=self._last) - 1
-        if (absent > 0).any():
+        if (absent > 0).any() and not held:
             bad = int(np.argmax(absent > 0))
             raise UserError(
                 f"{self.name}: row {found['rows'][bad]}: {absent[bad]} rows of the grid are absent before it, so "
