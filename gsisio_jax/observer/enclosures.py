@@ -17,6 +17,7 @@ from gsisio_jax.inclusion.transforms import AffineForm, affine_and_jacobian
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.cast import cast_known
+from gsisio_jax.observer.known_inputs import input_matrix
 from gsisio_jax.scalar.numpy_program import numpy_functions
 
 _Program = Callable[..., Any]
@@ -105,7 +106,8 @@ class Enclosures(NamedTuple):
         slopes: as from `slopes_of`.
         outputs: affine bounds of T2 g on a box of states, and the slack of their slope (q, n): every step begins with
             those on the state bounds. Source: theory 5.3.
-        maps: the same of [f; g; T2 g]; None where they take u, or angles come back to where they were.
+        maps: the same of [f; g; T2 g], without known inputs; None where these enter in another way than by a matrix
+            (`known_inputs`), or angles come back to where they were.
     """
 
     slopes: SlopesOfBox
@@ -115,7 +117,7 @@ class Enclosures(NamedTuple):
     @staticmethod
     def of(system: Any, T2: Any, u_region: Interval, dtype: Any = np.float64) -> Enclosures:
         of_all, first = affine_and_jacobian(all_maps(system, T2, dtype), with_slack=True), system.n + system.l
-        outputs_alone = system.takes_u or system.periodic_states
+        outputs_alone = bool(system.periodic_states) or (system.takes_u and not _moved_by_inputs(system, dtype))
 
         def bounds(x: Interval, u: Interval) -> tuple[Any, Any]:
             affine, jacobian = of_all(x, u)
@@ -125,7 +127,15 @@ class Enclosures(NamedTuple):
         slopes, found = _slopes(system, jacobian, u_region, dtype), _affine(affine, u_region, dtype)
         if outputs_alone:
             return Enclosures(slopes, found, None)
-        return Enclosures(slopes, lambda box: _rows_from(first, found(box)), found)
+        still = np.zeros(system.m)
+        maps = _affine(affine, Interval.unchecked(still, still), dtype) if system.takes_u else found
+        return Enclosures(slopes, lambda box: _rows_from(first, found(box)), maps)
+
+
+def _moved_by_inputs(system: Any, dtype: Any) -> bool:
+    """Known inputs only move f and g, as ``B u`` and ``D u`` do."""
+    with _able_to_hold(dtype):
+        return input_matrix(system, dtype) is not None
 
 
 def _rows_from(first: int, affine: Any) -> Any:

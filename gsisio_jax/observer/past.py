@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from gsisio_jax.inclusion.atoms import AtomBounds
 from gsisio_jax.interval.box import Interval, entire_like, magnitude
 from gsisio_jax.interval.image import image, widened_for_sums
+from gsisio_jax.observer.known_inputs import moved
 from gsisio_jax.observer.measurement import shift_box
 from gsisio_jax.plant.system import Noise
 
@@ -64,10 +65,13 @@ def last(carry: Any, d: Any) -> Past:
     return Past(carry.y, carry.u, carry.noise, carry.believed, ~carry.starts, carry.state, _kept(carry.h), d)
 
 
-def known(observer: Any, past: Past, terms: int) -> Interval:
-    """[B u + w; D u + v - y] of a step, and the bounds of inputs that have them, widened for sums."""
+def known(observer: Any, past: Past, terms: int, inputs: Any = None) -> Interval:
+    """[B u + w; D u + v - y] of a step, and the bounds of inputs that have them, widened for sums; with `inputs`, a
+    matrix (n + l, m) (`known_inputs`), what f and g make of u besides."""
     system = observer.system
     shift = shift_box(system, past.y, past.u, past.noise)
+    if inputs is not None:
+        shift = moved(inputs, past.u, shift)
     bounded = image(observer.bounded_inputs, system.input_bounds)
     lower, upper = (jnp.concatenate([getattr(box, side) for box in (shift, bounded)]) for side in ("lower", "upper"))
     return widened_for_sums(Interval.unchecked(lower, upper), terms)

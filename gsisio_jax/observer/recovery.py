@@ -18,6 +18,7 @@ from gsisio_jax.interval.image import plain_image, widened_for_sums
 from gsisio_jax.interval.primitives import scale
 from gsisio_jax.observer import past
 from gsisio_jax.observer.domain import Domain
+from gsisio_jax.observer.known_inputs import input_matrix, moved
 from gsisio_jax.observer.lost import plainly_wider
 from gsisio_jax.observer.measurement import everything_unless, output_box
 from gsisio_jax.observer.status import Source
@@ -32,7 +33,8 @@ class Recovery(eqx.Module):
         x_i in sum over t of {multipliers [B u + w; D u + v - y]}[k-1-t] + output (y - D u - v)[k] + constant
                + sum over t of known (bounded inputs)[k-1-t] + anchor x[k-N]  +-  slack size
 
-    where `size` is the largest number that enters, in units of its own.
+    where `size` is the largest number that enters, in units of its own. Where f and g take u, B and D are those of
+    ``[f; g](x, u) = [f; g](x, 0) + M u`` as well (`known_inputs`).
 
     Attributes:
         multipliers: (N, R, n + l).
@@ -71,8 +73,11 @@ class Recovery(eqx.Module):
 @jax.named_scope("recovery")
 def contract(observer: Any, domain: Domain, carry: Any, y: Any, u: Any, noise: Noise) -> Domain:
     """Contract the box of x[k] with all rows; they hold as long as all measurements that they use are believed."""
+    inputs = input_matrix(observer.system, y.dtype) if observer.system.takes_u else None
+    if observer.system.takes_u and inputs is None:  # f has traced numbers (`with_model`): what u does is not known
+        return domain
     for rows in observer.recovery:
-        domain = domain.intersect(_boxes(observer, rows, carry, y, u, noise), Source.STATE)
+        domain = domain.intersect(_boxes(observer, rows, carry, y, u, noise, inputs), Source.STATE)
     return domain
 
 
@@ -82,20 +87,22 @@ def covers_all(observer: Any) -> bool:
     return len({i for rows in alone for i in rows.targets}) == observer.system.n
 
 
-def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noise) -> Interval:
-    """What rows of one length say of x[k], (1, n)."""
+def _boxes(observer: Any, rows: Recovery, carry: Any, y: Any, u: Any, noise: Noise, inputs: Any) -> Interval:
+    """What rows of one length say of x[k], (1, n); `inputs` as for `past.known`."""
     system = observer.system
     steps = (past.last(carry, None), *carry.older)[: rows.length]
     terms = rows.length * rows.multipliers.shape[-1] + system.l + rows.known.shape[-1] * rows.length + 4
     terms += 0 if rows.anchor is None else system.n + 1
     now = output_box(system, y, u, noise.v)
+    if inputs is not None:
+        now = moved(-inputs[system.n :], u, now)
     total = plain_image(rows.output, widened_for_sums(now, terms))
     total = Interval.unchecked(total.lower + rows.constant.lower, total.upper + rows.constant.upper)
     size = jnp.maximum(scale(rows.scales[-1, system.n :], magnitude(now)).max(initial=0.0), rows.floor)
     holds = jnp.asarray(True)
     for lag, step in enumerate(steps):
         weights = jnp.concatenate([rows.multipliers[lag], rows.known[lag]], -1)
-        seen = past.known(observer, step, terms)
+        seen = past.known(observer, step, terms, inputs)
         part = plain_image(weights, seen)
         total = Interval.unchecked(total.lower + part.lower, total.upper + part.upper)
         size = jnp.maximum(size, scale(rows.scales[lag], magnitude(seen)[: system.n + system.l]).max(initial=0.0))
