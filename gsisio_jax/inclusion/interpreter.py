@@ -19,10 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from gsisio_jax.inclusion import one_variable
+from gsisio_jax.inclusion import nans, number_types, one_variable
 from gsisio_jax.inclusion.by_hand import BY_HAND, apply_by_hand
 from gsisio_jax.inclusion.form_arithmetic import Operation, fold, is_known, known_if_concrete
 from gsisio_jax.inclusion.loops import kept_loop, stack
+from gsisio_jax.inclusion.nan_flags import flag, flags_of, may_be_nan, pass_on
 from gsisio_jax.inclusion.node import as_node, is_node, normalise, normalised
 from gsisio_jax.inclusion.origin import remember, settled
 from gsisio_jax.inclusion.rules import comparison, linear, patterns
@@ -74,6 +75,7 @@ def evaluate(jaxpr: Any, consts: Sequence[Any], args: Sequence[Any]) -> list[Any
                 out = _watched(eqn, operands)
             elif match is not None:
                 rule, operands = match.rule, given
+                pass_on(given, [out])
         except UnknownPrimitiveError as error:
             if error.place is not None or (line := _caller(eqn)) is None:
                 raise
@@ -128,20 +130,39 @@ def _result(eqn: Any, args: Sequence[Any]) -> Any:
     by_hand = BY_HAND.get(name) or BY_HAND.get(eqn.params.get("name"))
     if by_hand is not None:
         value = normalise(apply_by_hand(by_hand, [normalised(arg) for arg in args]))
+        pass_on(args, [value])
         return [value] if eqn.primitive.multiple_results else value
     if name in CALLS:
         return CALLS[name](eqn, *args)
+    number_types.check(eqn)
     if name in MOVES:
-        return MOVES[name](eqn, *args)
+        value = nans.looked_at(eqn, args, MOVES[name](eqn, *args))
+        nans.note(name, eqn, args, value if eqn.primitive.multiple_results else [value])
+        return value
     if name in REDUCTIONS or name in ELEMENTWISE:
-        aligned = args if name in REDUCTIONS else _aligned(args, eqn.outvars[0].aval.shape)
-        value = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned)
-        if name in ("select_n", "mul") and is_node(value):
-            value = by_pieces(eqn, args, value, _result, ELEMENTWISE)
-        product = name in ("mul", "div") and all(map(is_node, args))
-        last = product or not (name in CURVES or (is_node(value) and value.unnormalised))
-        return normalise(value) if is_node(value) and last else value
+        return _counted(eqn, args)
     raise UnknownPrimitiveError(name)
+
+
+def _counted(eqn: Any, given: Sequence[Any]) -> Any:
+    """The result of an operation that counts or compares."""
+    name, out, args = eqn.primitive.name, eqn.outvars[0].aval, number_types.carried(eqn, given)
+    aligned = args if name in REDUCTIONS else _aligned(args, out.shape)
+    value, flags = (REDUCTIONS.get(name) or ELEMENTWISE[name])(eqn, *aligned), None
+    if name in ("select_n", "mul") and is_node(value):
+        plain, value = value, by_pieces(eqn, given, value, _result, ELEMENTWISE)
+        flags = flags_of(value) if value is not plain else None
+    product = name in ("mul", "div") and all(map(is_node, args))
+    last = product or not (name in CURVES or (is_node(value) and value.unnormalised))
+    value = normalise(value) if is_node(value) and last else value
+    value = nans.looked_at(eqn, args, value)
+    unsure = may_be_nan(args) if jnp.issubdtype(out.dtype, jnp.integer) else None
+    value = number_types.integer_result(eqn, name, args, value, unsure)
+    if not is_node(value) and jnp.issubdtype(out.dtype, jnp.floating) and may_be_nan(args) is not None:
+        value = nans.constant(value, out, args)
+    flag([value], flags or ())
+    nans.note(name, eqn, args, [value], passes=flags is None)
+    return value
 
 
 def _constant(eqn: Any, args: Sequence[Any]) -> Any:
@@ -179,15 +200,25 @@ def _call(eqn: Any, *args: Any) -> Any:
         jaxpr, consts = called_jaxpr(eqn)
     except LookupError:
         raise UnknownPrimitiveError(eqn.primitive.name, "without a body") from None
-    name = library_function(jaxpr)
+    plain = all(number_types.is_plain(out.aval.dtype) for out in eqn.outvars)
+    name = library_function(jaxpr) if plain else ""
     whole = WHOLE.get(name)
     if whole is not None and (given := _given(name, eqn, args)) is not None:
         found = whole(eqn, *given)
         if found is not None:
-            return [normalise(value) if is_node(value) else value for value in found]
+            return _library(name, eqn, given, [normalise(value) if is_node(value) else value for value in found])
     if name in LIBRARY and any(is_node(arg) for arg in args):
-        return [normalise(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))]
+        args = number_types.carried(eqn, args)
+        value = normalise(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))
+        return _library(name, eqn, args, [number_types.integer_result(eqn, name, args, value)])
     return evaluate(jaxpr, consts, args)
+
+
+def _library(name: str, eqn: Any, args: Sequence[Any], results: Sequence[Any]) -> list[Any]:
+    """Results of a function of JAX's libraries, with what is to be said of NaN."""
+    results = [nans.library_result(name, eqn, args, value) for value in results]
+    nans.note(name, eqn, args, results)
+    return results
 
 
 def _given(name: str, eqn: Any, args: Sequence[Any]) -> list[Any] | None:
@@ -211,10 +242,15 @@ def _cond(eqn: Any, index: Any, *args: Any) -> Any:
     if not is_node(index) and not isinstance(index, Tracer):
         chosen = branches[min(max(int(index), 0), len(branches) - 1)]
         return evaluate(chosen.jaxpr, chosen.consts, args)
+    if is_node(index):
+        number_types.check(eqn)
     outcomes = [evaluate(branch.jaxpr, branch.consts, args) for branch in branches]
     if len(branches) == 2 and not is_node(index):
         index = index != 0
-    return [comparison.select(index, *values) for values in zip(*outcomes, strict=True)]
+    results = [comparison.select(index, *values) for values in zip(*outcomes, strict=True)]
+    for value, cases in zip(results, zip(*outcomes, strict=True), strict=True):
+        pass_on(cases, [value])
+    return results
 
 
 def _scan(eqn: Any, *args: Any) -> Any:
@@ -231,7 +267,10 @@ def _scan(eqn: Any, *args: Any) -> Any:
         return kept_loop(_unwatched(turn), carry, xs, length, reverse)
     stacked: list[Any] = [None] * length
     for i in range(length)[::-1] if reverse else range(length):
-        carry, stacked[i] = turn(carry, [linear.move(lambda v, i=i: v[i], x) for x in xs])
+        rows = [linear.move(lambda v, i=i: v[i], x) for x in xs]
+        for x, row in zip(xs, rows, strict=True):
+            pass_on([x], [row])
+        carry, stacked[i] = turn(carry, rows)
     return [*carry, *(stack(list(column)) for column in zip(*stacked, strict=True))]
 
 

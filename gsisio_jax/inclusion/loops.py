@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from gsisio_jax.inclusion.nan_flags import flag, may_be_nan, pass_on
 from gsisio_jax.inclusion.node import POINT_MODE, Form, Node, as_node, is_node, jac_of, normalised, parts, slope_of
 from gsisio_jax.inclusion.rules import linear
 
@@ -15,7 +16,9 @@ from gsisio_jax.inclusion.rules import linear
 def stack(rows: list[Any]) -> Any:
     """The results of all turns along a new first axis."""
     if any(is_node(row) for row in rows):
-        return linear.structural(lambda *v: jnp.stack(v), rows)[0]
+        stacked = linear.structural(lambda *v: jnp.stack(v), rows)[0]
+        pass_on(rows, [stacked])
+        return stacked
     return jnp.stack(rows)
 
 
@@ -50,22 +53,42 @@ def kept_loop(turn: Callable[..., Any], carry: list[Any], xs: Sequence[Any], len
     def stacked(x: Any) -> Any:
         return Node(x[0], *_unstack(x[1], x[2], box)) if isinstance(x, tuple) else x
 
-    def step(carry: list[Any], rows: list[Any]) -> tuple[list[Any], list[Any]]:
-        new, out = turn([inward(c) for c in carry], [inward(row) for row in rows])
-        new = [promote(value, inward(like)) for value, like in zip(new, carry, strict=True)]
-        return [_bare(value) for value in new], [_bare(value) for value in out]
+    def run(carry: list[Any], rows: list[Any], unsure: Any) -> tuple[list[Any], list[Any], Any]:
+        """A turn, and whether something may be NaN in this one or was before; None: certainly not."""
+        given = [inward(v) for v in (*carry, *rows)]
+        flag(given, () if unsure is None else (unsure,))
+        new, out = turn(given[: len(carry)], given[len(carry) :])
+        now = may_be_nan([*new, *out])
+        return new, out, unsure if now is None else now if unsure is None else unsure | now
 
+    def step(state: tuple[list[Any], Any], rows: list[Any]) -> tuple[tuple[list[Any], Any], list[Any]]:
+        carry, unsure = state
+        new, out, unsure = run(carry, rows, unsure)
+        new = [promote(value, inward(like)) for value, like in zip(new, carry, strict=True)]
+        return ([_bare(value) for value in new], unsure), [_bare(value) for value in out]
+
+    unsure = may_be_nan([*carry, *xs])
+    unsure = None if unsure is None else jnp.asarray(unsure)
     rows = [outward(x) for x in xs]
     first = jax.tree.map(lambda v: v[0], rows)
+
+    def once(carry: list[Any], row: list[Any], before: Any) -> tuple[list[Any], Any]:
+        new, _, after = run(carry, row, before)
+        return [_bare(v) for v in new], after
+
     while True:
-        new = jax.eval_shape(lambda c, r: [_bare(v) for v in turn([inward(x) for x in c], [inward(x) for x in r])[0]],
-                             [_bare(c) for c in carry], first)  # fmt: skip
+        new, after = jax.eval_shape(once, [_bare(c) for c in carry], first, unsure)
         fuller = [promote(c, inward(like)) for c, like in zip(carry, new, strict=True)]
-        if jax.tree.structure(fuller) == jax.tree.structure(carry):
+        settled = (after is None) == (unsure is None)
+        unsure = unsure if settled else jnp.zeros((), bool)
+        if settled and jax.tree.structure(fuller) == jax.tree.structure(carry):
             break
         carry = fuller
-    last, ys = jax.lax.scan(step, [_bare(c) for c in carry], rows, length=length, reverse=reverse)
-    return [*(inward(c) for c in last), *(stacked(y) for y in ys)]
+    state = [_bare(c) for c in carry], unsure
+    (last, unsure), ys = jax.lax.scan(step, state, rows, length=length, reverse=reverse)
+    results = [*(inward(c) for c in last), *(stacked(y) for y in ys)]
+    flag(results, () if unsure is None else (unsure,))
+    return results
 
 
 def _bare(value: Any) -> Any:

@@ -271,8 +271,28 @@ def as_node(value: Any, shape: tuple[int, ...], dtype: Any) -> Node:
             ends = rounding.normal(value, value)
             return Node(Interval.unchecked(*(np.broadcast_to(end, shape) for end in ends)))
     value = np.broadcast_to(value, shape) if is_known(value) else jnp.broadcast_to(value, shape)
-    value = value if value.dtype == bool else value.astype(dtype)
-    return Node(Interval.unchecked(value, value))
+    if value.dtype == bool or exact_in(value, dtype):
+        value = value if value.dtype == bool else value.astype(dtype)
+        return Node(Interval.unchecked(value, value))
+    near = value.astype(dtype)
+    far = abs(near) >= 2.0 ** (jnp.finfo(dtype).nmant + 1)
+    if is_known(near):
+        below, above = np.nextafter(near, near.dtype.type(-np.inf)), np.nextafter(near, near.dtype.type(np.inf))
+    else:
+        below, above = rounding.down(near), rounding.up(near)
+    return Node(Interval.unchecked(where(far, below, near), where(far, above, near)))
+
+
+def exact_in(value: Any, dtype: Any) -> bool:
+    """Are these numbers, if they are integers, certainly numbers of that floating type?"""
+    if not (jnp.issubdtype(value.dtype, jnp.integer) and jnp.issubdtype(dtype, jnp.floating)):
+        return True
+    most = 2 ** (int(jnp.finfo(dtype).nmant) + 1)
+    if int(jnp.iinfo(value.dtype).max) <= most:
+        return True
+    return is_known(value) and all(
+        -most <= int(v) <= most for v in (np.min(value, initial=0), np.max(value, initial=0))
+    )
 
 
 def parts(values: Any) -> tuple[Any, Any]:

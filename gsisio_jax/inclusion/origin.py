@@ -14,6 +14,7 @@ import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import is_known
 from gsisio_jax.inclusion.known_boxes import case_is_open
+from gsisio_jax.inclusion.nan_flags import pass_on
 from gsisio_jax.inclusion.node import Node, is_node, normalised
 from gsisio_jax.interval.box import is_concrete
 
@@ -60,8 +61,10 @@ def origin(value: Any) -> Origin | None:
 def settled(value: Any) -> Any:
     """`normalised`, of the same origin."""
     found = normalised(value)
-    if found is not value and (before := origin(value)) is not None:
-        object.__setattr__(found, "origin", before)
+    if found is not value:
+        if (before := origin(value)) is not None:
+            object.__setattr__(found, "origin", before)
+        pass_on([value], [found])
     return found
 
 
@@ -155,6 +158,7 @@ class Again:
             results = [found.rule(*map(normalised, operands))]
             if results[0] is None:
                 raise NotAgain
+            pass_on(operands, results)
         else:
             out = self.apply(found.equation, operands)
             results = out if found.equation.primitive.multiple_results else [out]

@@ -234,7 +234,7 @@ class Bends:
 
 
 def _is_real(value: Any) -> bool:
-    return jnp.issubdtype(value.dtype, jnp.floating)
+    return jnp.issubdtype(value.dtype, jnp.floating) and jnp.finfo(value.dtype).bits >= 32
 
 
 def _larger(a: Bent, b: Bent) -> Bent | None:

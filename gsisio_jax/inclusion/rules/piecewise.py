@@ -30,6 +30,7 @@ import numpy as np
 from jax.core import Tracer
 
 from gsisio_jax.inclusion.form_arithmetic import box_sum, slope_image
+from gsisio_jax.inclusion.nan_flags import flag, flags_of, may_be_nan
 from gsisio_jax.inclusion.node import (
     Form,
     Node,
@@ -42,7 +43,8 @@ from gsisio_jax.inclusion.node import (
     slack_of,
     slope_of,
 )
-from gsisio_jax.inclusion.origin import Again, NotAgain, origin
+from gsisio_jax.inclusion.origin import Again, NotAgain, origin, settled
+from gsisio_jax.inclusion.rules.bilinear import pick
 from gsisio_jax.inclusion.rules.linear import move, subtract
 from gsisio_jax.inclusion.rules.possible import hull_of_cases
 from gsisio_jax.inclusion.rules.switches import Switch, switch_in, switch_of
@@ -86,7 +88,13 @@ def by_pieces(eqn: Any, args: Sequence[Any], plain: Node, apply: Apply, elementw
         return plain
     finally:
         _DEPTH.reset(token)
-    return _hull(plain, switch, cases, jumps)
+    found = _hull(plain, switch, cases, jumps)
+    flags = [case.possible.any() & case_flag for case in cases for case_flag in flags_of(case.node)]
+    if (unsure := may_be_nan([switch.pivot])) is not None:
+        found = pick(unsure, plain, found)  # a pivot that is no number is on no segment
+        flags += [unsure & plain_flag for v in args for plain_flag in flags_of(v)]
+    flag([found], flags)
+    return found
 
 
 def continuous_to(dtype: Any) -> float:
@@ -112,7 +120,7 @@ def _evaluated(
     """The result for another pivot, and with that value of the switch."""
     fixed = np.full(switch.node.shape, value, switch.node.dtype)
     found = again([(switch.pivot, pivot), (switch.node, fixed)]).equation(eqn, args)
-    return normalised(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
+    return settled(found) if is_node(found) else as_node(found, plain.shape, plain.dtype)
 
 
 def _jump(eqn: Any, args: Sequence[Any], again: Callable[[Any], Again], switch: Switch, i: int, plain: Node) -> _Jump:

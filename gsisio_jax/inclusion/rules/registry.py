@@ -156,8 +156,14 @@ def _div(eqn: Any, x: Any, y: Any) -> Node:
 
 def _rounding(eqn: Any, x: Node) -> Node:
     nearest_even = int(eqn.params["rounding_method"]) == 1
-    fn = jnp.round if nearest_even else lambda t: jnp.trunc(t + jnp.copysign(0.5, t))
-    return comparison.staircase(fn, -0.5, 0.5)(x)
+    return comparison.staircase(jnp.round if nearest_even else _away_from_zero, -0.5, 0.5)(x)
+
+
+def _away_from_zero(t: Any) -> Any:
+    """The nearest integer, of two the larger in magnitude; nothing here rounds, as adding a half would."""
+    size = abs(t)
+    whole = jnp.floor(size)
+    return jnp.copysign(whole + (size - whole >= 0.5), t)
 
 
 def _reduce(fn: Callable[[Any, Any], Node]) -> Rule:

@@ -104,6 +104,8 @@ def _unwound(switch: Switch) -> Switch | None:
         found = origin(switch.pivot)
         if found is None or len(switch.cuts) != 1 or not np.isfinite(switch.cuts[0]).all():
             return switch
+        if not np.issubdtype(found.equation.outvars[found.index].aval.dtype, np.floating):
+            return switch  # a sum of integers may have wrapped around
         (cut,), (below, above), (there,) = switch.cuts, switch.between, switch.at
         inner = found.operands[0]
         if found.name == "neg":
