@@ -152,6 +152,8 @@ def _counted(eqn: Any, given: Sequence[Any]) -> Any:
     if name in ("select_n", "mul") and is_node(value):
         plain, value = value, by_pieces(eqn, given, value, _result, ELEMENTWISE)
         flags = flags_of(value) if value is not plain else None
+    if name == "select_n" and flags is None:
+        flags = nans.of_cases(*args)
     product = name in ("mul", "div") and all(map(is_node, args))
     last = product or not (name in CURVES or (is_node(value) and value.unnormalised))
     value = normalise(value) if is_node(value) and last else value
@@ -208,9 +210,9 @@ def _call(eqn: Any, *args: Any) -> Any:
         if found is not None:
             return _library(name, eqn, given, [normalise(value) if is_node(value) else value for value in found])
     if name in LIBRARY and any(is_node(arg) for arg in args):
-        args = number_types.carried(eqn, args)
-        value = normalise(LIBRARY[name](eqn, *_aligned(args, eqn.outvars[0].aval.shape)))
-        return _library(name, eqn, args, [number_types.integer_result(eqn, name, args, value)])
+        numbers = number_types.carried(eqn, args)
+        value = normalise(LIBRARY[name](eqn, *_aligned(numbers, eqn.outvars[0].aval.shape)))
+        return _library(name, eqn, numbers, [number_types.integer_result(eqn, name, numbers, value)])
     return evaluate(jaxpr, consts, args)
 
 
@@ -247,9 +249,11 @@ def _cond(eqn: Any, index: Any, *args: Any) -> Any:
     outcomes = [evaluate(branch.jaxpr, branch.consts, args) for branch in branches]
     if len(branches) == 2 and not is_node(index):
         index = index != 0
-    results = [comparison.select(index, *values) for values in zip(*outcomes, strict=True)]
-    for value, cases in zip(results, zip(*outcomes, strict=True), strict=True):
-        pass_on(cases, [value])
+    results = []
+    for cases in zip(*outcomes, strict=True):
+        numbers = number_types.carried(eqn, cases) if is_node(index) else cases
+        results.append(comparison.select(index, *numbers))
+        pass_on(cases, results[-1:])
     return results
 
 

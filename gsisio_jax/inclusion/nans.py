@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.form_arithmetic import is_known, known_if_concrete
-from gsisio_jax.inclusion.nan_flags import flag, joined, may_be_nan, pass_on
+from gsisio_jax.inclusion.nan_flags import flag, flags_of, joined, may_be_nan, pass_on
 from gsisio_jax.inclusion.node import Node, as_node, is_node, normalised, parts
 from gsisio_jax.inclusion.rules.bilinear import pick
 from gsisio_jax.inclusion.rules.comparison import select, step
-from gsisio_jax.inclusion.rules.linear import negative
+from gsisio_jax.inclusion.rules.linear import move, negative
 from gsisio_jax.inclusion.rules.possible import unknown
 from gsisio_jax.interval.box import Interval, is_concrete
 
@@ -54,7 +54,7 @@ def note(name: str, eqn: Any, args: Sequence[Any], results: Sequence[Any], passe
         where = _holds_zero(args[0])
     elif name == "pow":
         where = _power(*args)
-    elif name in _BY_RESULT:
+    elif name in _BY_RESULT or (name == "gather" and is_node(args[1])):  # of places outside of a table
         bounds = [normalised(v).range for v in results if is_node(v)]
         where = joined([~(jnp.isfinite(b.lower) & jnp.isfinite(b.upper)).all() for b in bounds])
     where = None if where is None else where.any()
@@ -79,6 +79,19 @@ def _power(base: Any, exponent: Any) -> Any:
     if whole:
         return _holds_zero(base) if pole else None
     return ~(low > 0) if pole else ~(low >= 0)
+
+
+def of_cases(which: Any, *cases: Any) -> list[Any]:
+    """Flags of a choice: those of the cases that are possible."""
+    node = is_node(which)
+    low, high = (which.range.lower, which.range.upper) if node else 2 * (known_if_concrete(which),)
+    found = []
+    for i, case in enumerate(cases):
+        if flags := flags_of(case):
+            possible = ((high if i else ~low) if low.dtype == bool else (low <= i) & (i <= high)).any()
+            if not (is_known(possible) and not possible):
+                found += [one if is_known(possible) else one & possible for one in flags]
+    return found
 
 
 def constant(value: Any, out: Any, args: Sequence[Any]) -> Node:
@@ -155,9 +168,11 @@ def library_result(name: str, eqn: Any, args: Sequence[Any], value: Any) -> Any:
         return value
     if name in ("fmax", "fmin"):
         # Of a number and a NaN it is the number.
+        shape = value.shape
         for one, other in (args, args[::-1]):
             if (unsure := may_be_nan([one])) is not None:
-                value = select(_perhaps(value.shape, [one, other], unsure), value, other)
+                other = move(lambda v: jnp.broadcast_to(v, shape), other)
+                value = select(_perhaps(shape, [one, other], unsure), value, other)
         return value
     if name == "copysign":
         return select(_perhaps(value.shape, args, unsure), value, negative(value))

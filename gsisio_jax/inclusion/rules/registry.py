@@ -106,7 +106,7 @@ def _sub(eqn: Any, x: Any, y: Any) -> Any:
 
 def _relation(fn: Callable[..., Node], reflexive: bool) -> Rule:
     def rule(eqn: Any, x: Any, y: Any) -> Any:
-        return jnp.full(x.shape, reflexive) if _same(eqn) else fn(x, y)
+        return np.full(x.shape, reflexive) if _same(eqn) else fn(x, y)
 
     return rule
 
