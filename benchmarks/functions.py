@@ -33,6 +33,11 @@ points take by 2 % at most; **tight**: by half at most; **loose (r)**: r times a
 finite bound although the values (or derivatives) are bounded; **jump**: the function may jump inside the box, so the
 derivative has no bound; **refused**: `UnknownPrimitiveError`.
 
+Integers wrap around and saturate: where bounds leave the type, all of that type is possible. Bits of integers
+(`&`, `|`, `^`, `~`), complex numbers and those of 16 bits are refused, but where they do not depend on the box. Where a
+function may have no value (`sqrt` of negative numbers, 0 / 0), what looks at that (`isnan`, comparisons, `fmax`, casts)
+is open; NaN that come of overflow (`inf - inf`) are not followed.
+
 jax {jax}, float64, rounded outward.
 """
 

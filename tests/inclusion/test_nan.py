@@ -121,7 +121,7 @@ def test_functions_of_all_numbers_are_no_less_known():
     box = Interval([-np.inf, 0.0], [np.inf, np.inf])
     form = inclusion.affine(lambda x: jnp.where(jnp.isnan(x * x[::-1]), 0.0, x))(box)
     assert form.slope.tolist() == [[1, 0], [0, 1]]
-    plain = inclusion.natural(lambda x: jnp.where(x[0] * x[1] == x[0] * x[1], 1.0, 2.0))(box)
+    plain = inclusion.natural(lambda x: jnp.where((p := x[0] * x[1]) == p, 1.0, 2.0))(box)
     assert sides(plain) == [1, 1]
 
 
