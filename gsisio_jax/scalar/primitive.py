@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
+from jax import lax
 from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
 
@@ -92,13 +93,29 @@ def _derivative(primals: Any, tangents: Any, program: ScalarProgram, levels: Lev
     out = _program.bind(*primals, program=program, levels=levels)
     moving = tuple(type(t) is not ad.Zero for t in tangents)
     reaches = reached(program, moving)
-    found: Any = iter(())
-    if any(reaches):
+    results = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out]
+    places = [k for k, is_reached in enumerate(reaches) if is_reached]
+    if places:
         own = [t for t, moves in zip(tangents, moving, strict=True) if moves]
         both = tuple((*marks, *(m for m, moves in zip(marks, moving, strict=True) if moves)) for marks in levels)
-        found = iter(_tangent.bind(*primals, *own, program=program, moving=moving, levels=both))
-    zeros = (ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out)
-    return out, [next(found) if reaches_ else zero for reaches_, zero in zip(reaches, zeros, strict=True)]
+        found = _tangent.bind(*primals, *own, program=program, moving=moving, levels=both)
+        have, wanted = _result_levels(tangent_program(program, moving), both), _result_levels(program, levels)
+        for i, k in enumerate(places):
+            axes = ([marks[i] for marks in have], [marks[k] for marks in wanted])
+            results[k] = _spread(_apart(found[i], *axes), *axes, out[k].shape)
+    return out, results
+
+
+def _apart(value: Any, has: Sequence[bool], wants: Sequence[bool]) -> Any:
+    """The value without the axes that are not wanted: along these all entries are the same."""
+    present = [want for h, want in zip(has, wants, strict=True) if h][::-1]
+    return value if all(present) else value[tuple(slice(None) if want else 0 for want in present)]
+
+
+def _spread(value: Any, has: Sequence[bool], wants: Sequence[bool], shape: tuple[int, ...]) -> Any:
+    """The value in its shape with the axes that are wanted: its own and others, along which it stays the same."""
+    kept = [h for h, want in zip(has, wants, strict=True) if want][::-1]
+    return value if all(kept) else lax.broadcast_in_dim(value, shape, [i for i, h in enumerate(kept) if h])
 
 
 def _batched(primitive: Any) -> Callable[..., Any]:
@@ -114,36 +131,68 @@ def _batched(primitive: Any) -> Callable[..., Any]:
 
 
 def _transposed(cotangents: Any, *args: Any, program: ScalarProgram, moving: Mask, levels: Levels) -> Any:
+    """Cotangents of the tangents that come in, one program for all results that have the same axes.
+
+    Say result k has the axes A (those of everything that it depends on, whatever it does to it), the tangent j that
+    comes in the axes T, and t[i] means the entry of t at those axes of the index i that t has. Then
+
+        result_k[i] = sum over j of P_kj[i] * tangent_j[i]    for every index i over A, with T within A if P_kj is not 0,
+
+    so what result k adds to the cotangent of j at an index over T is the sum of ``P_kj[i] * cotangent_k[i]`` over the
+    axes of A that j lacks. A program of cotangents, mapped over its arguments, computes the sum of these products over
+    k for each i. Only where all k have the same axes can that sum be summed over axes: a cotangent without an axis (of
+    what a step hands on unchanged and all cases share) would count once for every entry of it.
+    """
     primals, linear = args[: len(moving)], args[len(moving) :]
-    nonzero = [type(c) is not ad.Zero for c in cotangents]
-    if not any(nonzero):
-        return [None] * len(args)
-    given = iter(nonzero)
-    wanted = tuple(r and next(given) for r in reached(program, moving))
-    back = cotangent_program(program, moving, wanted)
     out = _result_levels(tangent_program(program, moving), levels)
-    levels_back = tuple(
-        (*marks[: len(moving)], *(mark for mark, is_given in zip(marks_out, nonzero, strict=True) if is_given))
-        for marks, marks_out in zip(levels, out, strict=True)
-    )
-    own = [c for c, is_given in zip(cotangents, nonzero, strict=True) if is_given]
-    found = _program.bind(*primals, *own, program=back, levels=levels_back)
-    have = _result_levels(back, levels_back)
-    fitted = []
-    for i, (value, arg) in enumerate(zip(found, linear, strict=True)):
-        has = [marks[i] for marks in have[::-1]]
-        wants = [marks[len(moving) + i] for marks in levels[::-1]]
-        fitted.append(_fitted(value, has, wants, arg.aval.shape))
-    return [*(None for _ in primals), *fitted]
+    groups: dict[Mask, set[int]] = {}
+    for k, cotangent in enumerate(cotangents):
+        if type(cotangent) is not ad.Zero:
+            groups.setdefault(tuple(marks[k] for marks in out), set()).add(k)
+    reaches = reached(program, moving)
+    totals: list[Any] = [None] * len(linear)
+    for axes, members in groups.items():
+        results = iter(range(len(cotangents)))
+        wanted = tuple(is_reached and next(results) in members for is_reached in reaches)
+        own = [cotangents[k] for k in sorted(members)]
+        found = _pulled_back(cotangent_program(program, moving, wanted), primals, own, linear, axes, levels)
+        totals = [a if b is None else b if a is None else a + b for a, b in zip(totals, found, strict=True)]
+    return [*(None for _ in primals), *totals]
 
 
-def _fitted(value: Any, has: Sequence[bool], wants: Sequence[bool], shape: tuple[int, ...]) -> Any:
-    """A cotangent with the axes that its argument has: others are summed over, missing ones are filled."""
-    spare = [h and not w for h, w in zip(has, wants, strict=True) if h]
-    value = value.sum(tuple(axis for axis, is_spare in enumerate(spare) if is_spare))
-    kept = [h for h, w in zip(has, wants, strict=True) if w]
-    own = tuple(size if h else 1 for size, h in zip(shape, kept, strict=True))
-    return jnp.broadcast_to(value.reshape(own), shape)
+def _pulled_back(
+    back: ScalarProgram, primals: Any, cotangents: Any, linear: Any, axes: Mask, levels: Levels
+) -> list[Any]:
+    """What results that have these axes, one mark for every level, add to the cotangents of `linear`; None: nothing."""
+    count = len(primals)
+    marks_back = [(*marks[:count], *(mark for _ in cotangents)) for marks, mark in zip(levels, axes, strict=True)]
+    kept = [any(marks) for marks in marks_back]  # an axis of other results or of tangents alone is none here
+    levels_back = tuple(marks for marks, keep in zip(marks_back, kept, strict=True) if keep)
+    found = _program.bind(*primals, *cotangents, program=back, levels=levels_back)
+    out = iter(_result_levels(back, levels_back))
+    have = [next(out) if keep else (False,) * len(linear) for keep in kept]
+    own = sum(1 << i for i in range(count, count + len(cotangents)))
+
+    def fitted(j: int) -> Any:
+        wants = [marks[count + j] for marks in levels]
+        # Without a cotangent it is a constant, 0; with an axis that no result of these has, none depends on it.
+        if not back.sources()[j] & own or any(want and not axis for want, axis in zip(wants, axes, strict=True)):
+            return None
+        return _fitted(found[j], [marks[j] for marks in have], axes, wants)
+
+    return [fitted(j) if ad.is_undefined_primal(arg) else None for j, arg in enumerate(linear)]
+
+
+def _fitted(value: Any, has: Sequence[bool], axes: Sequence[bool], wants: Sequence[bool]) -> Any:
+    """A cotangent with the axes that its argument has: the others are summed over.
+
+    It has all of `axes`. What it has beyond these comes of primals that simplifying removed from the results but not
+    from here: it does not depend on them.
+    """
+    value = _apart(value, has, axes)
+    present = [want for axis, want in zip(axes, wants, strict=True) if axis][::-1]
+    spare = tuple(place for place, want in enumerate(present) if not want)
+    return value.sum(spare) if spare else value
 
 
 def _tangent_function(*args: Any, program: ScalarProgram, moving: Mask, levels: Levels) -> Any:
