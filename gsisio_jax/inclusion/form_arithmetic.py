@@ -17,6 +17,7 @@ from jax.core import Tracer
 
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, nan_to_unbounded
+from gsisio_jax.interval.devices import agreeing
 from gsisio_jax.interval.direct import absolute, minus, plus, where
 from gsisio_jax.interval.minmax import larger, smaller
 from gsisio_jax.interval.primitives import add_up, times
@@ -64,7 +65,7 @@ class Operation:
     params: tuple[tuple[str, Any], ...]
 
     def __call__(self, *values: Any) -> Any:
-        return self.primitive.bind(*map(jnp.asarray, values), **dict(self.params))
+        return self.primitive.bind(*agreeing([*map(jnp.asarray, values)]), **dict(self.params))
 
 
 @dataclass(frozen=True)

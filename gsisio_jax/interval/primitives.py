@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import ad, batching, mlir
 
+from gsisio_jax.interval.devices import agreeing, is_meshed, merged
 from gsisio_jax.interval.direct import alike, common, entries, plus
 
 
@@ -32,7 +33,7 @@ def elementwise(name: str, body: Callable[..., Any], derivative: Callable[..., A
     """
     primitive = jex.Primitive(name)
     primitive.def_impl(jax.jit(body))
-    primitive.def_abstract_eval(lambda first, *rest: first.update(weak_type=False))
+    primitive.def_abstract_eval(_type)
     mlir.register_lowering(primitive, mlir.lower_fun(body, multiple_results=False))
 
     def batch(args: Any, dims: Any) -> tuple[Any, int]:
@@ -53,10 +54,16 @@ def elementwise(name: str, body: Callable[..., Any], derivative: Callable[..., A
 
     def call(*args: Any) -> Any:
         shape, dtype = common(args)
-        return primitive.bind(*(alike(arg, shape, dtype) for arg in args))
+        return primitive.bind(*agreeing([alike(arg, shape, dtype) for arg in args]))
 
     call.primitive = primitive  # type: ignore[attr-defined]
     return call
+
+
+def _type(first: Any, *rest: Any) -> Any:
+    if not any(map(is_meshed, (first, *rest))):
+        return first.update(weak_type=False)
+    return merged((first, *rest), first.shape, first.dtype, [range(first.ndim)] * (1 + len(rest)))
 
 
 def _product_rule(partials: Callable[..., tuple[Any, Any]]) -> Callable[..., Any]:

@@ -15,11 +15,11 @@ import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 from jax import lax
-from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
 
 from gsisio_jax._collector import rare_collection
 from gsisio_jax._room import with_room
+from gsisio_jax.interval.devices import agreeing, is_meshed, merged
 from gsisio_jax.scalar.derivative import Mask, cotangent_program, reached, tangent_program
 from gsisio_jax.scalar.program import ScalarProgram
 
@@ -34,7 +34,7 @@ _program.multiple_results = _tangent.multiple_results = True
 def run(program: ScalarProgram, args: Sequence[Any]) -> list[Any]:
     """Entries of all results from entries of all arguments, array by array."""
     args = [jnp.asarray(arg, number.dtype) for arg, number in zip(args, program.inputs, strict=True)]
-    return _program.bind(*args, program=program, levels=())
+    return _program.bind(*agreeing(args), program=program, levels=())
 
 
 def written(eqn: Any) -> Callable[..., Any] | None:
@@ -76,11 +76,20 @@ def _types(args: Sequence[Any], program: ScalarProgram, levels: Levels) -> list[
         # Its axis stands in front of those of the levels before that this argument has.
         sizes.append(args[which].shape[-1 - sum(marks_[which] for marks_ in levels[:depth])])
     results = _result_levels(program, levels)
+    meshed = [i for i, arg in enumerate(args) if is_meshed(arg)]
     types = []
-    for i, dtype in enumerate(program.types):
-        shape = tuple(size for size, out in zip(sizes[::-1], results[::-1], strict=True) if out[i])
-        types.append(ShapedArray(shape, dtype))
+    for k, dtype in enumerate(program.types):
+        axes = _axes(results, k)
+        shape = tuple(sizes[depth] for depth in axes)
+        own = [_axes(levels, i) for i in meshed]
+        places = [[mine.index(depth) if depth in mine else None for depth in axes] for mine in own]
+        types.append(merged([args[i] for i in meshed], shape, dtype, places))
     return types
+
+
+def _axes(levels: Levels, i: int) -> list[int]:
+    """Levels of the axes of one argument or result, from its first axis to its last."""
+    return [depth for depth, marks in enumerate(levels) if marks[i]][::-1]
 
 
 @with_room
@@ -102,7 +111,7 @@ def _derivative(primals: Any, tangents: Any, program: ScalarProgram, levels: Lev
         have, wanted = _result_levels(tangent_program(program, moving), both), _result_levels(program, levels)
         for i, k in enumerate(places):
             axes = ([marks[i] for marks in have], [marks[k] for marks in wanted])
-            results[k] = _spread(_apart(found[i], *axes), *axes, out[k].shape)
+            results[k] = _spread(_apart(found[i], *axes), *axes, out[k])
     return out, results
 
 
@@ -112,10 +121,13 @@ def _apart(value: Any, has: Sequence[bool], wants: Sequence[bool]) -> Any:
     return value if all(present) else value[tuple(slice(None) if want else 0 for want in present)]
 
 
-def _spread(value: Any, has: Sequence[bool], wants: Sequence[bool], shape: tuple[int, ...]) -> Any:
-    """The value in its shape with the axes that are wanted: its own and others, along which it stays the same."""
+def _spread(value: Any, has: Sequence[bool], wants: Sequence[bool], like: Any) -> Any:
+    """The value with the axes that are wanted, as `like` has them: its own and others, along which it is the same."""
     kept = [h for h, want in zip(has, wants, strict=True) if want][::-1]
-    return value if all(kept) else lax.broadcast_in_dim(value, shape, [i for i, h in enumerate(kept) if h])
+    if all(kept):
+        return value
+    sharding = jax.typeof(like).sharding if is_meshed(jax.typeof(like)) else None
+    return lax.broadcast_in_dim(value, like.shape, [i for i, h in enumerate(kept) if h], out_sharding=sharding)
 
 
 def _batched(primitive: Any) -> Callable[..., Any]:
@@ -136,7 +148,7 @@ def _transposed(cotangents: Any, *args: Any, program: ScalarProgram, moving: Mas
     Say result k has the axes A (those of everything that it depends on, whatever it does to it), the tangent j that
     comes in the axes T, and t[i] means the entry of t at those axes of the index i that t has. Then
 
-        result_k[i] = sum over j of P_kj[i] * tangent_j[i]    for every index i over A, with T within A if P_kj is not 0,
+        result_k[i] = sum over j of P_kj[i] * tangent_j[i]    for every index i over A (P_kj is 0 if T is not in A),
 
     so what result k adds to the cotangent of j at an index over T is the sum of ``P_kj[i] * cotangent_k[i]`` over the
     axes of A that j lacks. A program of cotangents, mapped over its arguments, computes the sum of these products over

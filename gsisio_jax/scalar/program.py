@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from gsisio_jax.interval import minmax, primitives
+from gsisio_jax.interval import devices, minmax, primitives
 from gsisio_jax.interval.primitives import fusion_barrier
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
 from gsisio_jax.scalar.options import repeated
@@ -67,10 +67,13 @@ class ScalarProgram:
             return values[id(value)] if isinstance(value, Number) else value
 
         fenced = self._fenced()
+        axes = devices.union(args)  # of a mesh: constants, too, are to vary along them
         for stage, numbers in groupby(self.operations, stage_of):
             with jax.named_scope(stage):
                 for number in numbers:
                     operands = [read(value) for value in number.operands]
+                    if axes and number.name != "part":
+                        operands = devices.cast(operands, axes)
                     value = bound(number, operands)
                     values[id(number)] = fusion_barrier(value) if id(number) in fenced else value
         return [typed(read(v), dtype) for v, dtype in zip(self.outputs, self.types, strict=True)]

@@ -12,6 +12,7 @@ from jax.core import Tracer
 
 from gsisio_jax._collector import rare_collection
 from gsisio_jax._room import with_room
+from gsisio_jax.interval import devices
 from gsisio_jax.scalar.options import loops_are_functions
 from gsisio_jax.scalar.primitive import run
 from gsisio_jax.scalar.program import ScalarProgram, scalar_program
@@ -63,7 +64,7 @@ def scan(
     carry = jax.tree.map(jnp.asarray, carry)
     traced = _trace(body, carry, one, most=most)
     if traced is None:
-        return jax.lax.scan(in_tasks(wrap(body)), carry, xs, length=turns)
+        return devices.scan(in_tasks(wrap(body)), carry, xs, length=turns)
     program, consts, structure = traced
     flat_carry = jax.tree.leaves(carry)
     count = sum(math.prod(leaf.shape) for leaf in flat_carry)
@@ -74,12 +75,18 @@ def scan(
 
     numbers = tuple(entry for leaf in flat_carry for entry in _entries(leaf, 0))
     columns = tuple(entry for leaf in rows for entry in _entries(leaf, 1))
+    everything = devices.agreeing([*consts, *numbers, *columns])
+    consts, numbers, columns = _split(everything, len(consts), count)
     last, kept = jax.lax.scan(step, numbers, columns, length=turns)
     leaves = program.results
     packed = _packed([*last], leaves[: len(flat_carry)], ()) + _packed(
         [entry.reshape(turns) for entry in kept], leaves[len(flat_carry) :], (turns,)
     )
     return jax.tree.unflatten(structure, packed)
+
+
+def _split(values: Sequence[Any], first: int, second: int) -> tuple[Any, Any, Any]:
+    return values[:first], tuple(values[first : first + second]), tuple(values[first + second :])
 
 
 def _apart(entries: Sequence[Any]) -> list[Any]:

@@ -11,6 +11,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.interval.devices import agreeing
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
 
 _CALLS = {"jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint"}
@@ -89,6 +90,8 @@ def applied(graph: Graph, eqn: Any, args: list[Any], stage: str) -> Sequence[Any
     name = eqn.primitive.name
     if name in _CALLS:
         return evaluate(graph, *called_jaxpr(eqn), args, stage)
+    if name == "pvary":  # a number is the same wherever it is known: `devices.agreeing` says where
+        return args
     graph.stage = stage
     if name in _MOVES:
         return _MOVES[name](eqn, *args)
@@ -108,7 +111,7 @@ def applied(graph: Graph, eqn: Any, args: list[Any], stage: str) -> Sequence[Any
 def bind(eqn: Any, args: Sequence[Any]) -> Sequence[Any]:
     """Results of an equation on arrays."""
     if "custom" not in eqn.primitive.name:
-        out = eqn.primitive.bind(*args, **eqn.params)
+        out = eqn.primitive.bind(*agreeing(args), **eqn.params)
         return out if eqn.primitive.multiple_results else [out]
     # Functions with a derivative of their own: as a jaxpr of this equation alone, whatever its parameters are.
     given = dict(zip(map(id, eqn.invars), args, strict=True))

@@ -36,6 +36,7 @@ from gsisio_jax.inclusion.rules import (
     univariate,
 )
 from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.devices import agreeing
 
 
 class UnknownPrimitiveError(ValueError):
@@ -73,7 +74,7 @@ def _structural(*data: int, terms: Callable[[Any], int] = lambda eqn: 1, moving:
         def call(*values: Any) -> Any:
             for i, value in zip(where, values, strict=True):
                 fixed[i] = value
-            return eqn.primitive.bind(*fixed, **eqn.params)
+            return eqn.primitive.bind(*agreeing(fixed), **eqn.params)
 
         whole = call if rest else Operation(eqn.primitive, tuple(eqn.params.items()))
         nodes = linear.structural(whole, [args[i] for i in where], rest, terms(eqn))

@@ -27,6 +27,7 @@ from gsisio_jax.inclusion.rules.functions import CURVES
 from gsisio_jax.inclusion.rules.linear import add, move, multiple, negative, structural, subtract
 from gsisio_jax.inclusion.rules.possible import formless
 from gsisio_jax.inclusion.rules.univariate import apply
+from gsisio_jax.interval.devices import agreeing
 
 MOST_OPERATIONS = 100  # that the derivatives of one node may take
 # Primitives that move or add entries, and which of their operands are values; none: all of them.
@@ -113,7 +114,7 @@ class Tangents:
         def call(*given: Any) -> Any:
             for i, value in zip(values, given, strict=True):
                 fixed[i] = value
-            return found.equation.primitive.bind(*fixed, **found.equation.params)
+            return found.equation.primitive.bind(*agreeing(fixed), **found.equation.params)
 
         given = [self._zeros(v) if (t := tangents[i]) is None else t for i, v in enumerate(found.operands)]
         rest = [v for i, v in enumerate(found.operands) if i not in values]

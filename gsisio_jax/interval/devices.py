@@ -1,0 +1,92 @@
+"""What a type says besides shape and dtype where arrays lie on several devices; on one it says nothing.
+
+Inside `jax.shard_map` an array varies along axes of the mesh, or is the same on all devices along them: operands of one
+operation must agree. On a mesh with explicit axes (`jax.set_mesh`) it says along which of them every dimension lies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+from jax.core import ShapedArray
+from jax.sharding import NamedSharding, PartitionSpec
+
+
+def is_meshed(aval: Any) -> bool:
+    """The type says something about a mesh."""
+    sharding = getattr(aval, "sharding", None)
+    return sharding is not None and not sharding.mesh.empty
+
+
+def varying(aval: Any) -> frozenset[Any]:
+    """Axes of the mesh along which the value may differ from device to device."""
+    kind = getattr(aval, "manual_axis_type", None)  # before JAX 0.10 it was `vma`
+    return getattr(aval, "vma", frozenset()) if kind is None else kind.varying
+
+
+def agreeing(values: Sequence[Any]) -> Sequence[Any]:
+    """The values, all varying along the axes along which one of them does; what is known on each device is the same.
+
+    The derivative of that is a sum over the devices, so it belongs in front of a loop, not into it.
+    """
+    if jax.sharding.get_abstract_mesh().empty:
+        return values
+    return cast(values, union(values))
+
+
+def union(values: Sequence[Any]) -> frozenset[Any]:
+    """Axes along which any of the values varies."""
+    return frozenset().union(*(varying(jax.typeof(value)) for value in values))
+
+
+def cast(values: Sequence[Any], axes: frozenset[Any]) -> list[Any]:
+    """The values, varying along these axes, too."""
+    return [_varied(value, axes - varying(jax.typeof(value))) for value in values]
+
+
+def _varied(value: Any, axes: frozenset[Any]) -> Any:
+    if not axes:
+        return value
+    names = tuple(sorted(axes, key=str))
+    if hasattr(jax.lax, "pcast"):
+        return jax.lax.pcast(value, names, to="varying")
+    return getattr(jax.lax, "pvary")(value, names)  # noqa: B009 - its name in JAX 0.8
+
+
+def scan(body: Callable[..., Any], carry: Any, xs: Any, length: int | None = None) -> tuple[Any, Any]:
+    """`jax.lax.scan`, whose carry may vary along more axes of the mesh behind a turn than before the first."""
+    if jax.sharding.get_abstract_mesh().empty:
+        return jax.lax.scan(body, carry, xs, length=length)
+    leaves, structure = jax.tree.flatten(carry)
+    row = jax.tree.map(lambda x: jax.lax.index_in_dim(x, 0, keepdims=False), xs)
+    after = jax.make_jaxpr(lambda *args: jax.tree.leaves(body(*args)[0]))(carry, row).out_avals
+    axes = union(leaves).union(*map(varying, after))
+
+    def turn(carry: Any, row: Any) -> tuple[Any, Any]:
+        carry, out = body(carry, row)
+        return jax.tree.unflatten(structure, cast(jax.tree.leaves(carry), axes)), out
+
+    return jax.lax.scan(turn, jax.tree.unflatten(structure, cast(leaves, axes)), xs, length=length)
+
+
+def merged(avals: Sequence[Any], shape: tuple[int, ...], dtype: Any, places: Sequence[Sequence[int | None]]) -> Any:
+    """The type of a result of operands with such types.
+
+    Args:
+        avals: of the operands.
+        shape: of the result.
+        dtype: of the result.
+        places: for every operand, which of its dimensions each dimension of the result is; None where none.
+    """
+    meshed = [(aval, place) for aval, place in zip(avals, places, strict=True) if is_meshed(aval)]
+    if not meshed:
+        return ShapedArray(shape, dtype)
+    spec = []
+    for dimension in range(len(shape)):
+        found = (aval.sharding.spec[place[dimension]] for aval, place in meshed if place[dimension] is not None)
+        spec.append(next((name for name in found if name is not None), None))
+    like = max((aval for aval, _ in meshed), key=lambda aval: len(varying(aval)))
+    sharding = NamedSharding(like.sharding.mesh, PartitionSpec(*spec))
+    return like.update(shape=shape, dtype=dtype, weak_type=False, sharding=sharding)
