@@ -10,8 +10,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.core import ShapedArray
-from jax.sharding import NamedSharding, PartitionSpec
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 
 def is_meshed(aval: Any) -> bool:
@@ -29,10 +30,14 @@ def varying(aval: Any) -> frozenset[Any]:
 def agreeing(values: Sequence[Any]) -> Sequence[Any]:
     """The values, all varying along the axes along which one of them does; what is known on each device is the same.
 
-    The derivative of that is a sum over the devices, so it belongs in front of a loop, not into it.
+    On a mesh with explicit axes all say that they lie on it: the carry of a `jax.lax.scan` that JAX maps has to. The
+    derivative of that is a sum over the devices, so it belongs in front of a loop, not into it.
     """
-    if jax.sharding.get_abstract_mesh().empty:
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.empty:
         return values
+    if AxisType.Explicit in mesh.axis_types:
+        values = [value if is_meshed(jax.typeof(value)) else _placed(value) for value in values]
     return cast(values, union(values))
 
 
@@ -44,6 +49,25 @@ def union(values: Sequence[Any]) -> frozenset[Any]:
 def cast(values: Sequence[Any], axes: frozenset[Any]) -> list[Any]:
     """The values, varying along these axes, too."""
     return [_varied(value, axes - varying(jax.typeof(value))) for value in values]
+
+
+def stack(values: Sequence[Any], axis: int = 0) -> Any:
+    """`jnp.stack`, which JAX 0.10 cannot map over an explicit axis of a mesh where only some of the values have it."""
+    if jax.sharding.get_abstract_mesh().empty:
+        return jnp.stack(values, axis)
+    return jnp.concatenate([jnp.expand_dims(value, axis) for value in values], axis)
+
+
+def spread(value: Any, size: int, aval: Any, axis: int) -> Any:
+    """The value repeated along a new first axis, which lies on the mesh as an axis of a value of that type does."""
+    own = jax.typeof(value)
+    spec = own.sharding.spec if is_meshed(own) else (None,) * own.ndim
+    sharding = NamedSharding(aval.sharding.mesh, PartitionSpec(aval.sharding.spec[axis], *spec))
+    return jax.lax.broadcast_in_dim(value, (size, *own.shape), range(1, 1 + own.ndim), out_sharding=sharding)
+
+
+def _placed(value: Any) -> Any:
+    return jax.sharding.reshard(value, PartitionSpec())
 
 
 def _varied(value: Any, axes: frozenset[Any]) -> Any:
@@ -60,8 +84,11 @@ def scan(body: Callable[..., Any], carry: Any, xs: Any, length: int | None = Non
     if jax.sharding.get_abstract_mesh().empty:
         return jax.lax.scan(body, carry, xs, length=length)
     leaves, structure = jax.tree.flatten(carry)
+    leaves = agreeing(leaves)
     row = jax.tree.map(lambda x: jax.lax.index_in_dim(x, 0, keepdims=False), xs)
-    after = jax.make_jaxpr(lambda *args: jax.tree.leaves(body(*args)[0]))(carry, row).out_avals
+    after = jax.make_jaxpr(lambda *args: jax.tree.leaves(body(*args)[0]))(
+        jax.tree.unflatten(structure, leaves), row
+    ).out_avals
     axes = union(leaves).union(*map(varying, after))
 
     def turn(carry: Any, row: Any) -> tuple[Any, Any]:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import ad, batching, mlir
 
+from gsisio_jax.interval import devices
 from gsisio_jax.interval.devices import agreeing, is_meshed, merged
 from gsisio_jax.interval.direct import alike, common, entries, plus
 
@@ -37,9 +38,13 @@ def elementwise(name: str, body: Callable[..., Any], derivative: Callable[..., A
     mlir.register_lowering(primitive, mlir.lower_fun(body, multiple_results=False))
 
     def batch(args: Any, dims: Any) -> tuple[Any, int]:
-        size = next(x.shape[d] for x, d in zip(args, dims, strict=True) if d is not None)
+        first, axis = next((x, d) for x, d in zip(args, dims, strict=True) if d is not None)
+        size, aval = first.shape[axis], jax.typeof(first)
+        meshed = is_meshed(aval)
 
         def spread(x: Any, d: Any) -> Any:
+            if d is None and meshed:
+                return devices.spread(x, size, aval, axis)
             return alike(x, (size, *np.shape(x)), x.dtype) if d is None else x if d == 0 else jnp.moveaxis(x, d, 0)
 
         return primitive.bind(*map(spread, args, dims)), 0

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.atoms import States
+from gsisio_jax.interval import devices
 from gsisio_jax.interval.box import Interval, choose
 from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import cut, larger, largest, raised, smaller, smallest
@@ -77,7 +78,7 @@ def contract(
         best = jnp.argmax(least)
         return choose(some, left, box), tuple(where(some, jnp.inf, part[best]) for part in (slack, room))
 
-    box, (slack, room) = jax.lax.scan(turn, domain.box, None, length=ROUNDS)
+    box, (slack, room) = devices.scan(turn, domain.box, None, length=ROUNDS)
     return domain.record_margin(slack[-1], Source.OUTPUT).record_margin(room[-1], Source.STATE).with_box(box)
 
 

@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gsisio_jax.inclusion.atoms import AtomBounds, Rows, States, of_constant, wider
-from gsisio_jax.interval import rounding
+from gsisio_jax.interval import devices, rounding
 from gsisio_jax.interval.box import Interval, center_and_radius
 from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.minmax import larger, smaller
@@ -230,7 +229,7 @@ def repeated(turn: Callable[[Any], Any], state: Any, count: int, written: int) -
         for _ in range(count):
             state = turn(state)
         return state
-    return jax.lax.scan(lambda state, _: (turn(state), None), state, None, length=count)[0]
+    return devices.scan(lambda state, _: (turn(state), None), state, None, length=count)[0]
 
 
 def clip(value: Any, box: Interval) -> Any:

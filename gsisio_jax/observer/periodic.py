@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gsisio_jax.interval import rounding
+from gsisio_jax.interval import devices, rounding
 from gsisio_jax.interval.box import Interval, add, choose, is_concrete, nan_to_unbounded
 from gsisio_jax.interval.direct import where
 from gsisio_jax.interval.image import image, plain_image, widened_for_sums
@@ -152,7 +152,7 @@ def contract(
     unknown = Unwrapped(_with(y, rows, lost[: len(rows)]), noise, jnp.zeros(len(rows), bool), jnp.full_like(y, jnp.inf))
     if maps.expansion is None:  # large: compiled once for both
         _ = maps.free, maps.remainder  # made here: they are kept, and what a loop has traced is of no use behind it
-        turns = jax.lax.scan(lambda seen, _: turn(seen), jax.tree.map(jnp.asarray, unknown), None, length=2)[1]
+        turns = devices.scan(lambda seen, _: turn(seen), jax.tree.map(jnp.asarray, unknown), None, length=2)[1]
         (_, _, fallback, _), (now, domain, _, d) = (jax.tree.map(lambda leaf, i=i: leaf[i], turns) for i in range(2))
     else:
         now, (_, _, fallback, _) = turn(unknown)

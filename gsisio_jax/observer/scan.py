@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from gsisio_jax import scalar
 from gsisio_jax._memo import once
+from gsisio_jax.interval import devices
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import delayed, prediction_step, tolerant
 from gsisio_jax.observer import step as current_step
@@ -44,7 +45,7 @@ def turns(
     """``jax.lax.scan`` of a body with one step of the observer in it, computed as suits that step; `most` as in
     `scalar.scan`."""
     if isinstance(observer, TolerantObserver):  # many copies of one step: over arrays
-        return jax.lax.scan(scalar.in_tasks(body), jax.tree.map(jnp.asarray, carry), rows, length=length)
+        return devices.scan(scalar.in_tasks(body), jax.tree.map(jnp.asarray, carry), rows, length=length)
     return scalar.scan(body, carry, rows, length=length, most=most)
 
 

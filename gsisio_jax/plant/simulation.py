@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax._room import with_room
+from gsisio_jax.interval import devices
 from gsisio_jax.interval.box import Interval, is_concrete
 from gsisio_jax.interval.reading import check_type, is_whole, read_array
 from gsisio_jax.plant.periodic import wrapped_outputs
@@ -134,7 +135,7 @@ def _simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any) -
         return x_next, (x, y, w, v)
 
     drawn = (draw(key_w, bounds_w), draw(key_v, bounds_v))
-    last, (x, y, w, v) = jax.lax.scan(in_tasks(step), x0, (d, u, *drawn, bounds_w, bounds_v))
+    last, (x, y, w, v) = devices.scan(in_tasks(step), x0, (d, u, *drawn, bounds_w, bounds_v))
     return Simulation(jnp.concatenate([x, last[None]]), y, w, v)
 
 

@@ -165,7 +165,7 @@ def _packed(entries: list[Any], leaves: Sequence[jax.ShapeDtypeStruct], lead: tu
         if leaf.shape == ():
             out.append(part[0])
         elif part:
-            out.append(jnp.stack(part, axis=len(lead)).reshape(*lead, *leaf.shape))
+            out.append(devices.stack(part, len(lead)).reshape(*lead, *leaf.shape))
         else:
             out.append(jnp.zeros((*lead, *leaf.shape), leaf.dtype))
     return out

@@ -11,6 +11,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.interval import devices
 from gsisio_jax.interval.devices import agreeing
 from gsisio_jax.scalar.graph import Graph, Number, is_constant
 
@@ -180,7 +181,7 @@ def _stacked(entries: Sequence[Any], shape: tuple[int, ...], dtype: Any) -> Any:
     if shape and not any(isinstance(entry, jax.Array) for entry in entries):
         return jnp.asarray(np.array(list(entries), dtype).reshape(shape))
     numbers = [typed(value, dtype) for value in entries]
-    return jnp.stack(numbers).reshape(shape) if shape else numbers[0]
+    return devices.stack(numbers).reshape(shape) if shape else numbers[0]
 
 
 def _entries(graph: Graph, eqn: Any, args: list[Any]) -> np.ndarray:

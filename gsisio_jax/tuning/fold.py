@@ -15,6 +15,7 @@ import jax.numpy as jnp
 
 from gsisio_jax import scalar
 from gsisio_jax._calls import named_arguments
+from gsisio_jax.interval import devices
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import checks, scan
 from gsisio_jax.observer.checks import AnyObserver
@@ -121,7 +122,7 @@ def fold_rows(
     def chunk(both: Any, rows: Any) -> tuple[Any, None]:
         return scalar.scan(step, both, rows, wrap=_forget)
 
-    (_, state), _ = jax.lax.scan(chunk, (carry, state), rows)
+    (_, state), _ = devices.scan(chunk, (carry, state), rows)
     return state
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 import gsisio_jax as gx
@@ -19,7 +19,7 @@ COUNT = 8
 
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
-    system = gx.System(lambda x: 0.9 * x + 0.02 * x * x, lambda x: x, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
+    system = gx.System(lambda x: 0.9 * x + 0.02 * jnp.sin(x), lambda x: x, G=np.zeros((1, 0)), H=np.zeros((1, 0)))
     bounds = gx.Noise(gx.Interval.symmetric([0.01]), gx.Interval.symmetric([0.1]))
     observer = gx.design_observer(system, bounds, gx.Interval.symmetric([3.0]), bounds=["affine"])
     boxes = gx.Interval(-np.ones((COUNT, 1)), np.linspace(1, 2, COUNT)[:, None])
@@ -46,8 +46,8 @@ def main() -> None:
     def shared(function: Callable[..., Any], out: Any, **options: Any) -> Callable[..., Any]:
         return jax.shard_map(function, mesh=mesh, in_specs=(P(), P("cases")), out_specs=out, **options)
 
-    for run in (estimate, steps, folded):
-        expected = cases(run)(radius, boxes)
+    expected_of = {run: np.asarray(jax.jit(cases(run))(radius, boxes)) for run in (estimate, steps, folded)}
+    for run, expected in expected_of.items():
         found = jax.jit(shared(cases(run), P("cases")))(radius, boxes)
         assert len(found.addressable_shards) == 4
         np.testing.assert_allclose(found, expected, rtol=1e-12, err_msg=run.__name__)
@@ -64,6 +64,16 @@ def main() -> None:
         return jax.grad(lambda radius: cases(estimate)(radius, boxes)[:, -1].sum())(radius)
 
     np.testing.assert_allclose(jax.jit(shared(inside, P()))(radius, boxes), expected, rtol=1e-12)
+
+    explicit = jax.make_mesh((4,), ("cases",), axis_types=(AxisType.Explicit,))
+    with jax.set_mesh(explicit):
+        spread = jax.device_put(boxes, NamedSharding(explicit, P("cases")))
+        for run in (estimate, steps, folded):
+            found = jax.jit(cases(run))(radius, spread)
+            assert len({str(shard.index) for shard in found.addressable_shards}) == 4
+            np.testing.assert_allclose(found, expected_of[run], rtol=1e-12, err_msg=run.__name__)
+        found = jax.jit(jax.grad(lambda radius: cases(estimate)(radius, spread)[:, -1].sum()))(radius)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 if __name__ == "__main__":
