@@ -11,6 +11,7 @@ from oracles.uncompiled import in_numpy
 
 from gsisio_jax import scalar
 from gsisio_jax.interval.minmax import larger
+from gsisio_jax.scalar import primitive
 
 SIZES = (3, 2)  # of two nested batches, the outer first
 RANDOM = np.random.default_rng(3)
@@ -123,6 +124,14 @@ def test_a_tangent_has_the_axes_of_its_result():
     assert [x.shape for x in closed.out_avals] == 4 * [(3,)]
     [back] = jax.vjp(mapped, 2.0)[1]((np.array([1.0, 2.0, 4.0]), np.array([8.0, 16.0, 32.0])))
     assert back == 63
+
+
+def test_an_axis_without_meaning_is_not_summed_over():
+    """What simplifying left of a primal in the program of cotangents, but not in that of tangents."""
+    value = jnp.asarray(np.broadcast_to([1.0, 2.0], (3, 2)))
+    has, axes, wants = BOTH[::-1], (True, False), (False, False)  # the innermost level first
+    assert primitive._fitted(value, has, axes, wants) == 3
+    np.testing.assert_array_equal(primitive._fitted(value, has, axes, axes), [1, 2])
 
 
 def test_one_group_is_one_program():
