@@ -204,6 +204,6 @@ class _Reader:
 
 def _literal(atom: Any) -> Polynomial:
     value = np.asarray(atom.val, atom.aval.dtype)
-    if value.ndim or not np.issubdtype(value.dtype, np.number) or not np.isfinite(value):
+    if value.ndim or value.dtype.kind not in "fiu" or not np.isfinite(value):
         raise Unreadable
     return number(float(value))
