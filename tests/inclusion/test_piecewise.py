@@ -229,3 +229,57 @@ def test_a_known_threshold_that_moves():
     natural = inclusion.natural(function)(box, u)
     assert float(natural.lower[0]) <= values.min()
     assert float(natural.upper[0]) >= values.max()
+
+
+def test_a_jump_of_a_value_without_bounds_is_no_rounding():
+    """At the cut the value is known to have no bound, and neither has the jump: no share of that is small."""
+
+    def f(x):
+        return x * jnp.heaviside(jax.nn.softplus(x) - 4.0, -2.375)
+
+    for upper in (50.0, INF):
+        found = inclusion.jacobian(f)(Interval([0.625], [upper]))
+        assert np.isinf(found.lower).all()
+        assert np.isinf(found.upper).all()
+
+
+def _bent_sum(x):
+    return jnp.clip(x, -1.0, 1.0) + jnp.clip(x, 0.5, 2.0) + jnp.clip(x, -3.0, 0.0)
+
+
+@pytest.mark.parametrize("turned", [lambda v: -v, lambda v: -jnp.abs(v), lambda v: v - 2.4, lambda v: 0.5 - v - 0.5])
+def test_a_cut_of_a_sum_that_bends_is_none_of_its_variable(turned):
+    """The sum is bounded as a function of x, but ``-sum > -1.2`` changes where the sum is 1.2, not x."""
+
+    def f(x):
+        y = turned(_bent_sum(x))
+        return jnp.where(y > -1.2, y, 100.0)
+
+    box, x = Interval([0.5], [1.1]), np.linspace(0.5, 1.1, 601)[:, None]
+    value = at_points(f, x)
+    assert {100.0} < set(value.ravel())  # both cases are taken
+    for bounds in (inclusion.natural(f)(box), inclusion.affine(f)(box).range):
+        assert bounds.contains(value, -1e-12).all()
+
+
+def test_a_switch_beside_an_expression_known_as_a_whole():
+    """The difference that ends a log_softmax has one operand, the exponents."""
+
+    def f(x):
+        y = jax.nn.log_softmax(x)
+        return jnp.where(y > -1.0, y, 2.0 * y)
+
+    box = Interval([-0.5, 0.0, 0.2], [0.5, 0.3, 1.0])
+    x = np.random.default_rng(0).uniform(box.lower, box.upper, (500, 3))
+    assert inclusion.natural(f)(box).contains(at_points(f, x)).all()
+
+
+def test_a_choice_by_a_count_keeps_the_type_of_the_box():
+    def f(x):
+        return jnp.concatenate([jnp.piecewise(x, [x < -0.5, x > 0.7], [lambda v: v, lambda v: v * v, 1.0]), x])
+
+    box = Interval(np.array([-1.0, 0.0], np.float32), np.array([1.0, 0.5], np.float32))
+    form = inclusion.affine(f)(box)
+    assert np.asarray(form.slope).dtype == np.float32
+    x = np.random.default_rng(0).uniform(box.lower, box.upper, (500, 2))
+    assert form.range.contains(at_points(f, x), -1e-6).all()

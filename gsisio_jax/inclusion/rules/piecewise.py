@@ -77,6 +77,8 @@ def by_pieces(eqn: Any, args: Sequence[Any], plain: Node, apply: Apply, elementw
         switch = next((found for v in args if (found := switch_in(v)) is not None), None)
     if switch is None or switch.pivot.shape not in (plain.shape, ()) or not _fits(switch):
         return plain
+    if switch.pivot.dtype != plain.dtype:  # a count, of float64 beside a box of float32: so would be the form
+        return plain
     token = _DEPTH.set(_DEPTH.get() + 1)
     try:
         single = switch.pivot.range.lower.size == 1
@@ -215,7 +217,9 @@ def _loose(form: Form | None) -> Form | None:
 def _hull(plain: Node, switch: Switch, cases: Sequence[_Case], jumps: Sequence[_Jump]) -> Node:
     pivot = normalised(switch.pivot)
     tolerance = continuous_to(plain.dtype)
-    small = [[jump <= tolerance * jnp.maximum(j.size, 1) for jump in (j.below, j.above)] for j in jumps]
+    # Of a value without bounds no share is small.
+    sizes = [jnp.where(jnp.isfinite(j.size), jnp.maximum(j.size, 1), 1) for j in jumps]
+    small = [[jump <= tolerance * size for jump in (j.below, j.above)] for j, size in zip(jumps, sizes, strict=True)]
     slip = sum(jnp.where(ok[0], j.below, 0) + jnp.where(ok[1], j.above, 0) for ok, j in zip(small, jumps, strict=True))
     possible = [case.possible for case in cases]
     natural, _ = intersect(hull_of_cases(possible, [case.node.range for case in cases]), plain.range)

@@ -52,7 +52,7 @@ class Switch:
 def switch_of(node: Any) -> Switch | None:
     """The node as a switch; None where it is none, or where its cuts are not known."""
     found = origin(node)
-    if found is None:
+    if found is None or found.rule is not None:
         return None
     if found.name == "sign" and is_node(found.operands[0]):
         zero = np.zeros((), node.dtype)
@@ -103,6 +103,8 @@ def _unwound(switch: Switch) -> Switch | None:
     while True:
         found = origin(switch.pivot)
         if found is None or len(switch.cuts) != 1 or not np.isfinite(switch.cuts[0]).all():
+            return switch
+        if found.rule is not None:  # its operands are those of the expression that it ends, not its own
             return switch
         if not np.issubdtype(found.equation.outvars[found.index].aval.dtype, np.floating):
             return switch  # a sum of integers may have wrapped around
