@@ -38,7 +38,8 @@ class Origin(NamedTuple):
 
     @property
     def name(self) -> str:
-        return self.equation.primitive.name
+        """Of the operation that was done on the operands: nothing where these are what a rule took instead."""
+        return "" if self.rule is not None else self.equation.primitive.name
 
 
 class NotAgain(Exception):
@@ -169,7 +170,7 @@ class Again:
         shape = found.equation.outvars[found.index].aval.shape
         alike = found.rule is None or all(np.shape(v) == shape for v in found.operands if not is_node(v))
         alike &= found.rule is None or all(v.shape == shape for v in found.operands if is_node(v))
-        return alike and self.allowed is not None and found.name in self.allowed
+        return alike and self.allowed is not None and found.equation.primitive.name in self.allowed
 
 
 def decided(which: Any) -> int | None:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from inclusion_points import points
 
+import gsisio_jax as gx
 from gsisio_jax import inclusion
 from gsisio_jax.interval import Interval
 
@@ -43,6 +44,24 @@ def checked(f, lower, upper, dtype=np.float64, extra=(), count=24, rounding="out
         slip = (1e-4 if dtype == np.float32 else 1e-9) * (1 + np.abs(a) + np.abs(b))
         assert (((low - slip <= a - b) & (a - b <= high + slip)) | np.isnan(a - b)).all(), (x, y, a - b, jac)
     return natural, jac
+
+
+def estimated(f, v, least):
+    """States (9, 2) of a plant whose first state an unknown input moves, after its boxes were seen to hold them.
+
+    `v` bounds the noise of the first state as measured, and `least` that state in the region of the design.
+    """
+    noise = gx.Noise(w=Interval.symmetric([1e-6, 1e-6]), v=Interval.symmetric([v]))
+    system = gx.System(f, lambda x: x[:1], G=[[1.0], [0.0]], H=[[0.0]])
+    observer = gx.design_observer(system, noise, region=Interval([least, -9.0], [9.0, 9.0]), allow_uncertified=True)
+    x, states = np.array([1.0, 2.0]), []
+    for k in range(9):
+        states.append(x)
+        x = np.array(f(jnp.asarray(x)))
+        x[0] = 2.1 * np.cos(k) - 0.1
+    estimate = gx.estimate(observer, Interval([0.9, 1.9], [1.1, 2.1]), np.array(states)[:, :1])
+    assert np.asarray(estimate.state.contains(np.array(states))).all()
+    return np.array(states)
 
 
 def sides(box) -> list[float]:

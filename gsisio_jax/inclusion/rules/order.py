@@ -53,7 +53,7 @@ def sort(eqn: Any, *operands: Any) -> list[Any]:
     key = operands[0]
     if not is_node(key):
         # Only what is carried along depends on the box: places are known.
-        places = jnp.broadcast_to(jnp.arange(key.shape[axis]).reshape(-1, *(1,) * (key.ndim - axis - 1)), key.shape)
+        places = jax.lax.broadcasted_iota(int, key.shape, axis)
         order = jax.lax.sort((*operands[:keys], places), dimension=axis, is_stable=True, num_keys=keys)[-1]
         return [
             structural(lambda v: jnp.take_along_axis(v, order, axis), [v], [order])[0]

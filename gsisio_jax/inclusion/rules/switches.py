@@ -52,7 +52,7 @@ class Switch:
 def switch_of(node: Any) -> Switch | None:
     """The node as a switch; None where it is none, or where its cuts are not known."""
     found = origin(node)
-    if found is None or found.rule is not None:
+    if found is None:
         return None
     if found.name == "sign" and is_node(found.operands[0]):
         zero = np.zeros((), node.dtype)
@@ -77,9 +77,10 @@ def switch_in(value: Any, deepest: int = _DEEPEST) -> Switch | None:
     own = switch_of(value)
     if own is not None:
         return own
-    if found.name not in _THROUGH:
+    name = found.equation.primitive.name  # also of an expression that is known as a whole: it is evaluated as one
+    if name not in _THROUGH:
         return None
-    for operand in found.operands[:1] if found.name == "select_n" else found.operands:
+    for operand in found.operands[:1] if name == "select_n" else found.operands:
         inner = switch_in(operand, deepest - 1)
         if inner is not None:
             return inner
@@ -103,8 +104,6 @@ def _unwound(switch: Switch) -> Switch | None:
     while True:
         found = origin(switch.pivot)
         if found is None or len(switch.cuts) != 1 or not np.isfinite(switch.cuts[0]).all():
-            return switch
-        if found.rule is not None:  # its operands are those of the expression that it ends, not its own
             return switch
         if not np.issubdtype(found.equation.outvars[found.index].aval.dtype, np.floating):
             return switch  # a sum of integers may have wrapped around
