@@ -53,7 +53,7 @@ def discretize(
         dt: length of a step, in that unit of time.
         method: "taylor" (derivatives of f along the solution, error of order dt^(order + 1)), "euler" (order dt^2, the
             only one that allows kinks in f), "rk4" (order dt^5; its bound is looser than that of "taylor", 5 to 100
-            times the error) or "zoh" (exact; f must be affine in x and u).
+            times the error) or "zoh" (exact; f must be affine in x and u, wherever the plant may be within a step).
         region: box (n,) of states at the start of a step for which the bound is to hold.
         bound: False gives the map alone.
         u_bounds: box (m,) of known inputs for which the bound is to hold. Needed where f takes u.
@@ -137,18 +137,30 @@ def _held(
 ) -> tuple[Any, np.ndarray, Sides | None]:
     """The exact step of an affine field. An input without a bound is multiplied by the numbers of G as they are, as
     everywhere in this library; so the box of d is 0 in the error of rounding where there is none."""
-    A, B, c = affine(field, sides.joined(given.region, given.u))
-    parts, lost = held("discretize", A, [B, field.G, c[:, None]], given.h)
+    inputs = given.d if len(given.d[0]) else sides.symmetric(np.zeros(field.p))
+
+    def reach() -> Sides:
+        if field.p and not (len(given.d[0]) and np.isfinite(given.d).all()):
+            raise ValueError(
+                'discretize: method="zoh" needs an f that is affine everywhere where an unknown input has no bound, as '
+                "it can take the state anywhere within a step; f is affine on the region alone. Give `input_bounds`"
+            )
+        return StepError(
+            field, given.h, 1, False, given.h * field.G, given.u, given.d, given.spread, given.eps
+        ).enclosure(given.region)  # fmt: skip
+
+    of_field = affine(field, given.region, given.u, reach if bound else None)
+    A, c = of_field.A, of_field.c
+    parts, lost = held("discretize", A, [of_field.B, field.G, c[:, None]], given.h)
     if field.takes_u:
         found: Any = partial(maps.affine_of_x_and_u, parts[0], parts[1], parts[3][:, 0])
     else:
         found = partial(maps.affine_of_x, parts[0], parts[3][:, 0])
     if not bound:
         return found, parts[2], None
-    inputs = given.d if len(given.d[0]) else sides.symmetric(np.zeros(field.p))
     around = sides.joined(given.region, given.u, inputs, sides.symmetric(np.ones(1)))
     eps = 0.0 if given.eps <= np.finfo(np.float64).eps else given.eps
-    return found, parts[2], hold_error(A, parts, lost, around, given.spread, given.h, eps)
+    return found, parts[2], hold_error(A, parts, lost, around, given.spread + of_field.rest, given.h, eps)
 
 
 def _input_matrix(field: Field, given: Arguments) -> np.ndarray:

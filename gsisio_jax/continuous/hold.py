@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
 from gsisio_jax import inclusion
@@ -10,7 +13,8 @@ from gsisio_jax.continuous.exponential import exponential, integral_upper
 from gsisio_jax.continuous.field import Field
 from gsisio_jax.continuous.sides import Sides
 
-_AFFINE = 1e-9  # relative width of the enclosure of a slope that does not depend on the point
+_AFFINE = 1e-9  # relative width of the enclosure of a slope that hardly depends on the point
+_NUMBERS = 64 * float(np.finfo(np.float64).eps)  # and of one that is a number, to the rounding of its expression
 
 
 def held(call: str, A: np.ndarray, columns: list[np.ndarray], h: float) -> tuple[list[np.ndarray], np.ndarray]:
@@ -38,29 +42,84 @@ def held(call: str, A: np.ndarray, columns: list[np.ndarray], h: float) -> tuple
     return np.split(value[:n], n + np.cumsum([0, *widths])[:-1], axis=1), lost[:n]
 
 
-def affine(field: Field, everywhere: Sides) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B and c of ``f + drift = A x + B u + c`` on a box of (x, u), to rounding.
+@dataclass(frozen=True)
+class Affine:
+    """``f + drift = A x + B u + c + rest``, wherever the plant may be within a step.
+
+    Attributes:
+        A, B, c: (n, n), (n, m) and (n,).
+        rest: (n,), bound of the magnitude of what is left.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    c: np.ndarray
+    rest: np.ndarray
+
+
+def affine(field: Field, region: Sides, u: Sides, reach: Callable[[], Sides] | None) -> Affine:
+    """That of a field which is affine, and where it need not be so everywhere.
+
+    Args:
+        field: of the plant.
+        region: of states at the start of a step.
+        u: of known inputs.
+        reach: the box of states that a step from the region may meet, for a field that is affine in places; None where
+            no bound is asked for.
 
     Raises:
-        ValueError: the field is not affine there; the entry of the Jacobian that varies is named.
+        ValueError: the field is not affine where it has to be; the entry of the Jacobian that varies is named.
     """
     n, m = field.n, field.m
 
     def known(z: np.ndarray) -> np.ndarray:
         return field.known(z[:n], z[n:])
 
-    low, high = sides.sides(inclusion.jacobian(known)(sides.box(everywhere)))
+    def slopes(x: Sides) -> Sides:
+        return sides.sides(inclusion.jacobian(known)(sides.box(sides.joined(x, u))))
+
+    def split(J: np.ndarray, c: np.ndarray, rest: np.ndarray) -> Affine:
+        return Affine(J[:, :n], J[:, n:], c, rest)
+
+    found = slopes(region)
+    _refuse_bent(_bent(found, _AFFINE), found, n, "")
+    middle, everywhere = 0.5 * found[0] + 0.5 * found[1], (np.full(n, -np.inf), np.full(n, np.inf))
+    none = np.zeros(n + m), np.zeros(n + m)
+    if not _bent(slopes(everywhere), _NUMBERS).any():
+        c = np.asarray(inclusion.natural(known)(sides.box(none)).center)
+        return split(middle, c, np.zeros(n))
+    # Affine in places: at 0, or beyond the region, f may be another one.
+    around = sides.joined(region if reach is None else reach(), u)
+    if reach is not None:
+        found = slopes((around[0][:n], around[1][:n]))
+        _refuse_bent(_bent(found, _AFFINE), found, n, " where the plant may be within a step")
+        middle = 0.5 * found[0] + 0.5 * found[1]
+    low, high = sides.joined(region, u)
+    start = 0.5 * low + 0.5 * high
+    value = sides.sides(inclusion.natural(known)(sides.box((start, start))))
+    center = 0.5 * value[0] + 0.5 * value[1]
+    far = np.maximum(around[1] - start, start - around[0])
+    rest = np.maximum(found[1] - middle, middle - found[0]) @ far + np.maximum(value[1] - center, center - value[0])
+    rounded = 4 * (n + m + 2) * np.finfo(np.float64).eps * (abs(middle) @ (abs(start) + far) + abs(center))
+    return split(middle, center - middle @ start, (rest + rounded) * (1 + 1e-9) + 1e-300)
+
+
+def _bent(slopes: Sides, share: float) -> np.ndarray:
+    """Which of them vary by more than a share of themselves."""
     with np.errstate(invalid="ignore"):
-        wide = ~(high - low <= _AFFINE * np.maximum(sides.magnitude((low, high)), 1e-12))
-    if wide.any():
-        i, j = np.argwhere(wide)[0]
-        name = f"x[{j}]" if j < n else f"u[{j - n}]"
-        raise ValueError(
-            f'discretize: method="zoh" needs an f that is affine; df[{i}]/d{name} lies between {low[i, j]:.6g} and '
-            f'{high[i, j]:.6g}. Use method="taylor" or "rk4"'
-        )
-    slopes, none = 0.5 * low + 0.5 * high, (np.zeros(n + m), np.zeros(n + m))
-    return slopes[:, :n], slopes[:, n:], np.asarray(inclusion.natural(known)(sides.box(none)).center)
+        return ~(slopes[1] - slopes[0] <= share * np.maximum(sides.magnitude(slopes), 1e-12))
+
+
+def _refuse_bent(bent: np.ndarray, slopes: Sides, n: int, where: str) -> None:
+    if not bent.any():
+        return
+    i, j = np.argwhere(bent)[0]
+    name = f"x[{j}]" if j < n else f"u[{j - n}]"
+    raise ValueError(
+        f'discretize: method="zoh" needs an f that is affine{where}; df[{i}]/d{name} lies between '
+        f'{slopes[0][i, j]:.6g} and {slopes[1][i, j]:.6g}. Use method="taylor" or "rk4"'
+        + (", a smaller region, or a shorter dt" if where else "")
+    )
 
 
 def hold_error(

@@ -128,6 +128,28 @@ def test_a_pole_that_a_short_step_cannot_reach_is_no_obstacle():
         gx.discretize(lambda x: -1 / (2 + x), 2.5, region=wide)
 
 
+@pytest.mark.parametrize(
+    ("f", "region", "exact"),
+    [
+        (lambda x: jnp.clip(3 * x, -1, 1) + 2, [1.0, 2.0], lambda x: x + 0.3),  # at 0 it is another one
+        (lambda x: -jnp.abs(x), [1.0, 2.0], lambda x: x * np.exp(-0.1)),
+        # A slope of -1, and of -1 + 4e-10 up to x = 1: more than rounding.
+        (
+            lambda x: -x + 4e-10 * jnp.clip(x, -1, 1),
+            [0.0, 3.0],
+            lambda x: x * np.exp(-0.1) + 4e-10 * np.where(x < 1, 0.1 * np.exp(-0.1) * x, 1 - np.exp(-0.1)),
+        ),
+    ],
+)
+def test_a_hold_of_what_is_affine_only_there(f, region, exact):
+    model = gx.discretize(f, 0.1, "zoh", region=Interval(*np.array(region)[:, None]))
+    x = np.linspace(*region, 11)[:, None]
+    left = exact(x) - in_numpy(jax.vmap(model.f))(x)
+    # The oracle rounds, too; what was missed were .1 and 1e-10.
+    assert np.asarray(Interval(model.error.lower - 1e-15, model.error.upper + 1e-15).contains(left)).all()
+    assert model.error.width[0] < 1e-9
+
+
 def test_kinks_are_bounded_on_both_sides():
     """``-|x|`` grows at a rate of 1 on one side and falls on the other: of Euler's error both signs occur."""
     model = gx.discretize(lambda x: -jnp.abs(x), 0.1, "euler", region=Interval([-1.0], [1.0]))
@@ -180,6 +202,18 @@ WRONG = {
     "not affine": (
         lambda: gx.discretize(plants.pendulum, 0.1, "zoh", region=SWING),
         r'df\[1\]/dx\[0\] lies between .* Use method="taylor"',
+    ),
+    "affine at the start of a step": (
+        lambda: gx.discretize(lambda x: 1 + jnp.maximum(x - 1, 0), 0.1, "zoh", region=Interval([0.0], [0.95])),
+        r"affine where the plant may be within a step; df\[0\]/dx\[0\] lies between .* or a shorter dt",
+    ),
+    "affine at a point": (
+        lambda: gx.discretize(jnp.sin, 0.1, "zoh", region=Interval([1.0], [1.0])),
+        "affine where the plant may be within a step",
+    ),
+    "affine in places, and pushed": (
+        lambda: gx.discretize(lambda x: -jnp.abs(x), 0.1, "zoh", region=Interval([1.0], [2.0]), G=[[1.0]]),
+        "affine everywhere where an unknown input has no bound.*Give `input_bounds`",
     ),
     "jump": (lambda: gx.discretize(jnp.sign, 0.1, "euler", region=ONE), "f is not Lipschitz on .* without the jump"),
     "kink": (
