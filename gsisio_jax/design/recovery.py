@@ -24,6 +24,7 @@ from gsisio_jax.plant.system import Noise
 from gsisio_jax.scalar.numpy_program import numpy_function
 
 _MOST_STATES = 12  # beyond, a trial takes seconds, and is left out where rows prove as much
+_FAR = 1e5  # widths from a bound that has no other side
 _LISTED = 3  # so many lost rows at least, if they are no more than states: boxes are as wide as the gap is long
 
 
@@ -83,33 +84,45 @@ def _plain(steps: np.ndarray) -> tuple[float, ...]:
 
 class Trial:
     """A noise-free run from the centre of the region over n + 5 steps, and up to n more if it can be followed so long.
-    In NumPy: a few steps take less time than the compilation of one."""
+    In NumPy: a few steps take less time than the compilation of one.
 
-    def __init__(self, observer: Observer | DelayedObserver, start: np.ndarray, u: np.ndarray, rows: np.ndarray):
-        self.observer, self.start, self.u, self.rows = observer, start, u, rows
-        self.noise = Noise.unchecked(*(known(box, np.float64) for box in (observer.noise.w, observer.noise.v)))
+    Where f and g are affine it is a run of which every bound is as far away on either side (`_centred`): boxes of other
+    data meet each other and the bounds off their middle, and so are no wider.
+    """
+
+    def __init__(
+        self, observer: Observer | DelayedObserver, start: np.ndarray, u: np.ndarray, rows: np.ndarray, noise: Noise
+    ):
+        self.observer, self.start, self.u, self.rows, self.noise = observer, start, u, rows, noise
         self.step: Any = None
 
     @classmethod
     def of(cls, observer: Observer | DelayedObserver, u_region: Interval) -> Trial | None:
         """None where the trajectory leaves the domain of f or g: nothing can be said for it."""
         system = observer.system
-
-        def nominal(x: Any, u: Any) -> tuple[Any, Any]:
-            """Output of this step and state of the next one, without noise."""
-            y = system.measurement(x, u) + jnp.asarray(system.D) @ u
-            return y, system.dynamics(x, u) + jnp.asarray(system.B) @ u
-
+        least = system.n + 5 + _delay(observer)
         with jax.enable_x64(True):
             start, u = (np.asarray(box.center, np.float64) for box in (observer.certificate.region, u_region))
+            noise = Noise.unchecked(*(known(box, np.float64) for box in (observer.noise.w, observer.noise.v)))
+            if not observer.certificate.region_matters and _lopsided(system, noise):
+                start, y, noise = _centred(observer, start, u, noise)
+                return cls(observer, start, u, np.tile(y, (least + system.n, 1)), noise)
+            d, w, v = (_nearest_to_zero(box) for box in (system.input_bounds, noise.w, noise.v))
+            moved, seen = np.asarray(system.G) @ d + w, np.asarray(system.H) @ d + v
+
+            def nominal(x: Any, u: Any) -> tuple[Any, Any]:
+                """Output of this step and state of the next one, without noise."""
+                y = system.measurement(x, u) + jnp.asarray(system.D) @ u
+                x = system.dynamics(x, u) + jnp.asarray(system.B) @ u
+                return y + seen if seen.any() else y, x + moved if moved.any() else x
+
             x, plant, rows = start, numpy_function(nominal, start, u), []
-            least = system.n + 5 + _delay(observer)
             while len(rows) < least + system.n:
                 y, x = plant(x, u)
                 if not np.isfinite(y).all():
                     break
                 rows.append(y)
-        return cls(observer, start, u, np.array(rows)) if len(rows) >= least else None
+        return cls(observer, start, u, np.array(rows), noise) if len(rows) >= least else None
 
     @property
     def most_lost(self) -> int:
@@ -119,23 +132,31 @@ class Trial:
 
     def widths(self, initial: Interval, rows: np.ndarray) -> np.ndarray:
         """Widths of the boxes of all steps, (T, n)."""
-        return self._widths(self._begin(initial), rows)[1][_delay(self.observer) :]
+        carries = self._begin(initial)
+        return np.max([self._widths(carry, rows)[1][_delay(self.observer) :] for carry in carries], 0)
 
     def after_gaps(self, initial: Interval, most: int | None) -> Iterator[np.ndarray]:
         """Widths (T, n) of the boxes from the first row on after gaps of 1, 2, ... `most_lost` rows behind the first
         one; of so many rows at most, or of all that there are."""
         delay, lost = _delay(self.observer), np.full_like(self.rows[0], np.nan)
-        carry, _ = self._widths(self._begin(initial), self.rows[:1])
+        carries = [self._widths(carry, self.rows[:1])[0] for carry in self._begin(initial)]
         for count in range(1, self.most_lost + 1):
-            carry, _ = self._widths(carry, [lost])
+            carries = [self._widths(carry, [lost])[0] for carry in carries]
             after = self.rows[1 + count :]
-            yield self._widths(carry, after if most is None else after[: most + delay])[1][delay:]
+            after = after if most is None else after[: most + delay]
+            yield np.max([self._widths(carry, after)[1][delay:] for carry in carries], 0)
 
-    def _begin(self, initial: Interval) -> Any:
-        """The carry before the first step."""
+    def _begin(self, initial: Interval) -> list[Any]:
+        """Carries before the first step: one, or one for every step of the run in which an input that is constant for
+        some steps may change first."""
         with jax.enable_x64(True):
             box = known(initial, np.float64)
-            return numpy_function(lambda box: blank(self.observer, box), box)(box)
+            carry = numpy_function(lambda box: blank(self.observer, box), box)(box)
+        block = self.observer.system.input_constant or 1
+        if carry.memory is None or block == 1:
+            return [carry]
+        phases = range(block - 1, max(-1, block - 2 - len(self.rows)), -1)
+        return [replace(carry, memory=replace(carry.memory, phase=np.asarray(phase, np.float64))) for phase in phases]
 
     def _widths(self, carry: Any, rows: Any) -> tuple[Any, np.ndarray]:
         """The carry behind these rows, and the widths that the steps report, (T, n)."""
@@ -151,6 +172,46 @@ class Trial:
     def _step(self, carry: Any, y: Any) -> tuple[Any, Interval]:
         after, out = advance(self.observer, carry, y, self.u, self.noise, False)
         return after, out.state
+
+
+def _lopsided(system: Any, noise: Noise) -> bool:
+    """Is a nominal run nearer to one side of some bound than to the other, or may it become so?"""
+    boxes = system.input_bounds, noise.w, noise.v
+    around_zero = all((np.asarray(box.lower) == -np.asarray(box.upper)).all() for box in boxes)
+    bounds = np.array([system.state_bounds.lower, system.state_bounds.upper])
+    return not around_zero or bool(np.isfinite(bounds).any())
+
+
+def _centred(
+    observer: Observer | DelayedObserver, start: np.ndarray, u: np.ndarray, noise: Noise
+) -> tuple[np.ndarray, np.ndarray, Noise]:
+    """A state that stays where it is, in the middle of its bounds as the input is, its output, and noise bounds that
+    have the same widths and what keeps the state there in their middle.
+
+    Widths of boxes of affine maps depend on data by where boxes and bounds are cut alone, and on no offset of w.
+    """
+    system, certificate = observer.system, observer.certificate
+    x = _middle(system.state_bounds, start, np.asarray(certificate.steady_width))
+    d = _middle(system.input_bounds, np.zeros(system.p), np.asarray(certificate.input_width))
+    w, v = (np.asarray(box.center, np.float64) for box in (noise.w, noise.v))
+    y = np.asarray(system.measurement(x, u)) + system.D @ u + system.H @ d + v
+    stays = x - np.asarray(system.dynamics(x, u)) - system.B @ u - system.G @ d - w
+    moved = Interval.unchecked(noise.w.lower + stays, noise.w.upper + stays)
+    return x, np.asarray(y), Noise.unchecked(moved, noise.v)
+
+
+def _middle(box: Interval, free: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """The centre of bounds; far from a bound that is alone, in widths of boxes; `free` where there is none."""
+    low, high = np.asarray(box.lower, np.float64), np.asarray(box.upper, np.float64)
+    below, above = np.isfinite(low), np.isfinite(high)
+    far = 2 * _FAR * np.where(np.isfinite(width) & (width > 0), width, 1.0)
+    from_one = np.where(below, low + far, np.where(above, high - far, free))
+    both = below & above
+    return np.where(both, 0.5 * np.where(both, low, 0) + 0.5 * np.where(both, high, 0), from_one)
+
+
+def _nearest_to_zero(box: Interval) -> np.ndarray:
+    return np.clip(0.0, np.asarray(box.lower, np.float64), np.asarray(box.upper, np.float64))
 
 
 def _delay(observer: Observer | DelayedObserver) -> int:

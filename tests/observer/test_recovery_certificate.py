@@ -100,3 +100,54 @@ def test_states_that_nothing_shows_are_named():
     without = gx.design_observer(system, noise, region, missing=False, **fast).certificate
     with pytest.raises(ValueError, match="must be that of a design with missing=True"):
         without.rows_until_finite()
+
+
+# Bounds that a run without input and noise is nearer to on one side: there boxes are cut by them.
+BOUNDS = {
+    "a state near its bound": {"state_bounds": ([-np.inf, 0.0], [np.inf, 100.0]), "input_bounds": ([-1.0], [1.0])},
+    "a bound on one side": {"state_bounds": ([-np.inf, 0.0], [np.inf, np.inf]), "input_bounds": ([-1.0], [1.0])},
+    "an input that is never 0": {"input_bounds": ([5.0], [7.0])},
+}
+
+
+def held_after_gaps(observer, initial, y, gaps, lost):
+    """Widths (gaps, n) in the first row after gaps that begin in these rows, in front of which boxes had settled."""
+    rows, certificate = np.array(gaps), observer.certificate
+    records = np.tile(y, (len(gaps), 1, 1))
+    for record, gap in zip(records, gaps, strict=True):
+        record[gap : gap + lost] = np.nan
+    width = np.asarray(jax.vmap(lambda y: gx.estimate(observer, initial, y))(records).state.width)
+    assert (width[range(len(gaps)), rows - 1] <= certificate.steady_width * (1 + 1e-4)).all()
+    assert (certificate.rows_until_finite(lost) == 0).all()
+    after = width[range(len(gaps)), rows + lost]
+    assert (after <= certificate.recovered_width(lost) * (1 + 2e-4)).all()
+    return after
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_widths_after_a_gap_are_promised_for_any_data(name):
+    """The promise was what a run from the middle of the region shows, whose boxes bounds may cut more than others."""
+    A, G = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([[0.0], [1.0]])
+    bounds = {key: gx.Interval(*sides) for key, sides in BOUNDS[name].items()}
+    system = gx.System(lambda x: A @ x, lambda x: x[:1], G=G, H=[[0.0]], **bounds)
+    noise = gx.Noise(gx.Interval.symmetric([1e-3, 1e-3]), gx.Interval([0.0], [0.02]))
+    region = gx.Interval([-100.0, 0.0], [100.0, 100.0])
+    observer = gx.design_observer(system, noise, region, window=1, sweeps=1)
+    x, y, push = np.array([0.0, 50.0]), [], 6.0 * ("never" in name)
+    for _ in range(8):
+        y.append(x[:1] + 0.01)
+        x = A @ x + G[:, 0] * push
+    after = held_after_gaps(observer, gx.Interval([-1.0, 49.0], [1.0, 51.0]), np.array(y), (4,), 2)
+    assert (after.max(0) >= 0.9 * observer.certificate.recovered_width(2)).all()
+
+
+def test_widths_after_a_gap_are_promised_wherever_it_lies_in_a_block():
+    """Of an input that is constant for four steps the promise was that of gaps in one place: .46 in place of .77."""
+    A = np.array([[0.44, -0.92, 1.1], [-0.13, 0.35, 0.51], [0.16, 0.12, -0.89]])
+    C = np.array([[-0.18, -0.54, 0.0], [-2.7, -1.56, -0.29], [0.26, -0.2, 0.0]])
+    more = {"input_rate": [0.195], "input_constant": 4}
+    system = gx.System(lambda x: A @ x, lambda x: C @ x, G=[[-1.13], [0.45], [0.32]], H=[[0.0], [0.0], [-0.81]], **more)
+    noise = gx.Noise(gx.Interval.symmetric([0.003, 0.013, 0.006]), gx.Interval.symmetric([0.016, 0.149, 0.012]))
+    observer = gx.design_observer(system, noise, gx.Interval.entire(3), window=1, sweeps=1)
+    after = held_after_gaps(observer, gx.Interval.symmetric([0.1] * 3), np.zeros((15, 3)), (8, 9, 10, 11), 3)
+    assert after[:, 2].max() > 0.7
