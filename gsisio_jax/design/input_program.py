@@ -146,6 +146,8 @@ class InputSizes:
 def depths_of(parts: np.ndarray, sizes: InputSizes) -> np.ndarray:
     """How many steps rows look back, (R,)."""
     P, N, p, R = sizes.problem, sizes.length, len(sizes.d), len(parts)
+    if not R:
+        return np.zeros(0, int)
     ends = np.cumsum([(N + 1) * P.n, N * P.n, N * P.l, P.l, N * p, p])
     _, of_f, of_g, _, moves, _, boxes = (part.reshape(R, -1) for part in np.split(parts, ends, 1))
     used = np.concatenate([part.reshape(R, N, -1) for part in (of_f, of_g, moves, boxes)], 2)

@@ -291,3 +291,12 @@ def test_rates_and_blocks_that_say_nothing_cost_nothing():
     system = cart(input_rate=[np.inf], input_constant=1)
     assert system.input_rate is None
     assert system.input_constant is None
+
+
+def test_where_no_row_helps_there_is_none(monkeypatch):
+    """Of a block of steps rows are found, and none is worth its time: that was an error of NumPy."""
+    monkeypatch.setattr(input_rows, "_LEAST_GAIN", 1e9)
+    system = gx.System(lambda x: 0.5 * x, lambda x: x, G=[[1.0]], H=[[0.0]], input_constant=2)
+    noise = gx.Noise(Interval.symmetric([0.1]), Interval.symmetric([0.1]))
+    found = gx.design_observer(system, noise, Interval.entire(1), missing=False, sweeps=1, window=1)
+    assert found.input_rows is None
