@@ -39,9 +39,13 @@ class Containment(Coverage):
     double: bool
 
     def compare(self, total: Any, box: Interval, truth: Any) -> Any:
-        outside = jnp.maximum(box.lower - truth, truth - box.upper)
-        rounding = SLACK[self.double] * (jnp.abs(truth) + box.width)
-        outside = jnp.where(outside <= rounding, jnp.minimum(outside, 0), outside)
+        below, above = box.lower - truth, truth - box.upper
+        outside = jnp.maximum(below, above)
+        # The width says how large the numbers are that were rounded; an infinite one says nothing of the other side.
+        size = jnp.where(jnp.isfinite(box.width), box.width, jnp.abs(jnp.where(below > above, box.lower, box.upper)))
+        size = jnp.abs(truth) + jnp.where(jnp.isfinite(size), size, 0)
+        outside = jnp.where(outside <= SLACK[self.double] * size, jnp.minimum(outside, 0), outside)
+        outside = jnp.where(jnp.isnan(box.lower) | jnp.isnan(box.upper), jnp.inf, outside)  # no box holds anything
         return total[0] + (outside <= 0), jnp.maximum(total[1], outside)
 
     def init(self, first: StepOutput, context: Context) -> Any:

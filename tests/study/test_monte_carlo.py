@@ -242,3 +242,16 @@ def test_a_store_is_gone_on_with_and_knows_the_functions(observer, tmp_path, red
     for change in ({"d": lambda key, k, x: 2 * manoeuvre(key, k, x)}, {"key": 6}, {"draw": "vertices"}, {"runs": [1]}):
         with pytest.raises(ValueError, match="another study"):
             carlo(observer, store=path, **usual | change)
+
+
+def test_a_half_infinite_box_that_misses_is_told():
+    """Its width is infinite, and is no measure of rounding."""
+    box = gx.Interval([0.0, -np.inf, 0.0, -np.inf, 0.0], [np.inf, -1.0, np.inf, np.inf, 1e3])
+    truth = jnp.array([-5.0, -1.0 + 1e-6, -0.0, 7.0, -1e-8])
+    inside, outside = study.containment.Containment(True).compare((jnp.zeros(5), jnp.zeros(5)), box, truth)
+    np.testing.assert_array_equal(inside, [0, 0, 1, 1, 1])  # the last one may be rounding, of numbers up to 10^3
+    np.testing.assert_allclose(outside, [5, 1e-6, 0, 0, 0])
+    nothing = gx.Interval.unchecked(jnp.full(5, jnp.nan), jnp.full(5, jnp.nan))
+    inside, outside = study.containment.Containment(True).compare((jnp.zeros(5), jnp.zeros(5)), nothing, truth)
+    assert not inside.any()
+    assert (outside > 0).all()
