@@ -28,6 +28,11 @@ def program(function: Any, n: int, m: int) -> list[str]:
     closed = jax.make_jaxpr(lambda x, u: function(x, u))(
         jax.ShapeDtypeStruct((n,), dtype), jax.ShapeDtypeStruct((m,), dtype)
     )
+    return lines(closed)
+
+
+def lines(closed: Any) -> list[str]:
+    """`program` of what JAX has traced already, jaxprs inside of it and their arrays included."""
     return list(_lines(closed, {}))
 
 

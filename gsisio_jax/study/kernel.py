@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.files.program import program
+from gsisio_jax.files.tree import encode
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.checks import AnyObserver
-from gsisio_jax.observer.delayed import DelayedObserver
 from gsisio_jax.observer.fixed import Fixed, chosen, jitted
-from gsisio_jax.observer.tolerant import TolerantObserver
 from gsisio_jax.plant.periodic import nearest
 from gsisio_jax.scalar.options import loop_bytes
 from gsisio_jax.study import later
@@ -265,21 +265,15 @@ def fingerprint(
     versions of JAX may round in other places, so they count as well.
     """
     system = observer.system
-    maps = jax.make_jaxpr(system.maps)(np.zeros(system.n), np.zeros(system.m))
+    maps = [program(function, system.n, system.m) for function in (system.dynamics, system.measurement)]
     names = [repr(r) if is_dataclass(r) else f"{type(r).__qualname__} {r.name}" for r in reductions]
-    inner = observer.inner if isinstance(observer, DelayedObserver | TolerantObserver) else observer
-    static = [getattr(inner, name, None) for name in ("bounds", "sweeps", "output_rows", "framer", "rounding")]
-    if isinstance(observer, DelayedObserver):
-        static.append((observer.delay, observer.lift.more))
-    if isinstance(observer, TolerantObserver):
-        static.append(f"tolerates {observer.tolerate}")
-    if system.periodic or system.periodic_states:
-        static.append((system.periodic, system.periodic_states))
+    # All that the observer is but f and g, also what is no array: numbers of cells and of sweeps, periods, targets.
+    arrays: dict[str, np.ndarray] = {}
+    structure = encode(observer, "observer", arrays)
     text, constants = source.identity(observer)
-    digest = hashlib.sha256(repr((jax.__version__, str(maps.jaxpr), text, names, *static, *rest)).encode())
-    # f and g make the structure of the observer's pytree differ between processes, but not its leaves.
+    digest = hashlib.sha256(repr((jax.__version__, maps, text, names, structure, *rest)).encode())
     numbers = {name: bare(argument) for name, argument in arguments.items()}
-    for leaf in (*maps.consts, *constants, *jax.tree.leaves(observer), *jax.tree.leaves(numbers)):
+    for leaf in (*constants, *arrays.values(), *jax.tree.leaves(numbers)):
         array = np.ascontiguousarray(leaf)
         digest.update(f"{array.dtype}{array.shape}".encode())
         digest.update(array.data.cast("B") if array.size else b"")

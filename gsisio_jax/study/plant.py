@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax.files.program import lines
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.tolerant import TolerantObserver
@@ -88,15 +89,13 @@ class Simulated(Rows):
     def identity(self, observer: Any) -> tuple[str, list[Any]]:
         key, k, x = jax.random.key(0, impl=self.impl), jnp.int32(0), jnp.zeros(observer.system.n)
         given = (self.x0, (key,)), (self.d, (key, k, x)), (self.draw, (key, k, x, observer.noise))
-        text, constants = [f"Simulated {self.length} {self.impl}"], []
+        text = [f"Simulated {self.length} {self.impl}"]
         for function, arguments in given:
             if callable(function):
-                traced = jax.make_jaxpr(function)(*arguments)
-                text.append(str(traced.jaxpr))
-                constants += traced.consts
+                text += lines(jax.make_jaxpr(function)(*arguments))
             else:
                 text.append(str(function))
-        return "\n".join(text), constants
+        return "\n".join(text), []
 
     def _measure(self, observer: Any, case: Any, key: Any, k: Any, x: Any, before: Any, given: Any) -> Any:
         """Row k; what moves the plant on to x[k+1]: x, d, u, w and its bounds; and what is outside of its bounds."""

@@ -382,16 +382,26 @@ def test_the_fingerprint_tells_studies_apart_and_knows_a_study_again(study):
     moved = gx.grid("box", gx.Interval(study.initial.lower, np.nextafter(study.initial.upper, 9)))
     steeper = replace(study.observer, system=replace_maps(study.observer.system, 1.0000001))
     others = [of(initial=moved), of(steeper), of(reduce=(settle(5),)), of(reduce=(settle(4),))]
-    assert len({of(), *others}) == 5
+    # What is no array of the observer, and what a jitted part of f reads.
+    system = study.observer.system
+    others += [of(replace(study.observer, **change)) for change in ({"cells": (4, 1)}, {"corrections": 7})]
+    plants = [replace_maps(system, jitted=add) for add in (1.0, 2.0)]
+    plants += [replace_maps(system, input_constant=m) for m in (2, 3)]
+    others += [of(replace(study.observer, system=plant)) for plant in plants]
+    assert len({of(), *others}) == 11
 
 
 SETTLED = (settle(3),)
 
 
-def replace_maps(system, factor=None):
-    """The same plant with another function object for f, times a factor."""
+def replace_maps(system, factor=None, jitted=None, **more):
+    """The same plant with another function object for f, times a factor, or with an array added in a jitted part."""
     f = (lambda x: system.f(x)) if factor is None else (lambda x: factor * system.f(x))
-    return gx.System(f, system.g, system.G, system.H, state_bounds=system.state_bounds)
+    if jitted is not None:
+        offset = np.full(system.n, jitted)
+        added = jax.jit(lambda x: x + offset)
+        f = lambda x: added(system.f(x))  # noqa: E731
+    return gx.System(f, system.g, system.G, system.H, state_bounds=system.state_bounds, **more)
 
 
 class Terminal(io.StringIO):
