@@ -20,6 +20,7 @@ from gsisio_jax.plant.system import Noise, System
 from gsisio_jax.tuning.compiled import quickly
 from gsisio_jax.tuning.fold import fold_rows
 from gsisio_jax.tuning.model import with_model
+from gsisio_jax.tuning.promised_slopes import width_slopes
 
 KINDS = ("final", "steady", "certificate")
 
@@ -60,7 +61,8 @@ def width_sensitivity(
         (kind, signal), `derivative` (kind, signal, bound), and `elasticity`, the share of the width that a share of the
         bound is worth: 1 says that 10 % off the bound takes 10 % off the width. Where a width is infinite, NaN. The
         certificate knows no initial box; its derivative by it is 0, and that by a parameter takes the gain as
-        re-optimised. The widths of the run are those of fixed gains: where the design lets terms cancel exactly, they
+        re-optimised (NaN where rows over several steps, or ``split``, promise less than that gain does). The widths of
+        the run are those of fixed gains: where the design lets terms cancel exactly, they
         have a kink in the parameters, and the derivative is one of its subgradients.
 
     Raises:
@@ -148,14 +150,12 @@ def _certificate(observer: Observer, noise: Noise, model: Any, parameters: Any, 
     slope = np.full((n + p, n + l + n + len(parameters)), np.nan)
     if not certificate.certified:
         return width, slope
-    by_w, by_v, now, before, input_v = (
-        np.asarray(a) for a in (
-            certificate.noise_w, certificate.noise_v,
-            certificate.input_state_now, certificate.input_state_before, certificate.input_noise_v,
-        )
-    )  # fmt: skip
-    state = certificate.response @ np.concatenate([by_w, by_v], axis=1)
-    inputs = (now + before) @ state + np.concatenate([now, input_v], axis=1)
+    now, before, input_v = (
+        np.asarray(a) for a in (certificate.input_state_now, certificate.input_state_before, certificate.input_noise_v)
+    )
+    state, narrower = width_slopes(certificate, noise)
+    of_w = now if certificate.input_noise_w is None else now + np.asarray(certificate.input_noise_w)
+    inputs = (now + before) @ state + np.concatenate([of_w, input_v], axis=1)
     slope[:, : n + l] = np.concatenate([state, inputs])
     slope[:, n + l : n + l + n] = 0
     if model is not None:
@@ -167,7 +167,8 @@ def _certificate(observer: Observer, noise: Noise, model: Any, parameters: Any, 
         best = jax.jit(
             jax.jacrev(lambda q: optimal_widths(lambda at: (model(rebuild(at)), noise, region), q, u_region))
         )
-        slope[:n, n + l + n :] = np.asarray(best(parameters))
+        # What rows over several steps, or slices, narrow further is no function of the gain alone.
+        slope[:n, n + l + n :] = np.where(narrower[:, None], np.nan, np.asarray(best(parameters)))
     return width, slope
 
 

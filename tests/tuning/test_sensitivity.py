@@ -1,13 +1,17 @@
 """The sensitivity table against differences of runs and of certificates."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import systems
 from oracles.uncompiled_calls import compiled
 
 import gsisio_jax as gx
 from gsisio_jax.tuning.model import with_model
+from gsisio_jax.tuning.sensitivity import _certificate
 
 STEP = 1e-6
 ROWS = 12
@@ -97,3 +101,27 @@ def test_errors(axis):
         with_model(axis.observer, other(None))
     with pytest.raises(ValueError, match="must hold 2 names"):
         gx.width_sensitivity(axis.observer, axis.initial, axis.y[0], names={"state": ["a"]})
+
+
+def test_the_promise_of_rows_over_several_steps_and_of_slices_against_differences():
+    """`window` and `split` promise less than the certified gain alone, and what they promise has other slopes."""
+    turn = 0.98 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    none = {"G": np.zeros((2, 0)), "H": np.zeros((1, 0))}
+    linear = gx.System(lambda x: turn @ x, lambda x: x[:1], **none)
+    noise = gx.Noise(gx.Interval.symmetric([0.02, 0.03]), gx.Interval.symmetric([0.1]))
+    tank = replace(systems.s7(), region=gx.Interval([8.0, 5.0, 0.6, 0.2], [20.0, 25.0, 4.0, 5.0]))
+    for observer in (
+        gx.design_observer(linear, noise, gx.Interval.entire(2), missing=False, sweeps=1, window=4),
+        tank.design(missing=False, sweeps=1, window=1, split=4),
+    ):
+        noise, certificate, n = observer.noise, observer.certificate, observer.system.n
+        width, found = _certificate(observer, noise, None, jnp.zeros(0), None)
+        size = np.concatenate([noise.w.width, noise.v.width])
+
+        def at(size, certificate=certificate, n=n):
+            noise = gx.Noise(*map(gx.Interval.symmetric, np.split(size / 2, [n])))
+            return np.concatenate([certificate.widths(noise), certificate.input_widths(noise)])
+
+        np.testing.assert_allclose(at(size), width)
+        differences = [(at(size + h) - at(size - h)) / (2 * h.sum()) for h in 1e-4 * np.diag(size)]
+        np.testing.assert_allclose(found[:, : len(size)], np.transpose(differences), rtol=1e-4, atol=1e-6)
