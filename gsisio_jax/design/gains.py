@@ -15,6 +15,7 @@ from gsisio_jax.design.linear_program import Expression, LinearProgram, diagonal
 from gsisio_jax.design.problem import GainProblem
 
 _SPARSE = 1e-7  # scaled gain entries below this are the interior-point solver's noise
+_LEAST = 1e-4  # of the largest effect of an input on a state: with 1e-12 of that, rounding of it
 _SOLVER: dict[str, Any] = {
     "solver": "CLARABEL",
     "tol_gap_abs": 1e-11,
@@ -149,11 +150,22 @@ def _finish(
     plain = _project(inner, N, np.broadcast_to(usable, N.shape))
     width = np.ones(inner.n)
     cost_plain, cost_sparse = inner.row_cost(plain, width), inner.row_cost(sparse, width)
-    exact = np.abs(inner.residual(sparse)[:, inner.free]).max(axis=1, initial=0.0) < 1e-12
+    exact = _cancels(inner, sparse, 1e-12)
     N = np.where((exact & (cost_sparse <= cost_plain * (1 + 1e-6)))[:, None], sparse, plain)
-    if np.abs(inner.residual(N)[:, inner.free]).max(initial=0.0) > 1e-9:
+    if not _cancels(inner, N, 1e-9).all():
         return None
     return _project(problem, problem.unscale(N, scale), N != 0)
+
+
+def _cancels(problem: GainProblem, N: np.ndarray, share: float) -> np.ndarray:
+    """Does every row of a gain cancel the free inputs, (n,)? To a share of what cancels in it: an input has no bound,
+    so what is left of one that hardly moves a state, in units of wide boxes, is as wrong as that of any other."""
+    free = problem.free
+    left = np.abs(problem.residual(N)[:, free]).max(axis=1, initial=0.0)
+    sizes = (np.abs(problem.G) + np.abs(N) @ np.abs(problem.seen))[:, free].max(axis=1, initial=0.0)
+    # Rows of states that no input moves hold what rounding leaves of others.
+    moved = np.abs(problem.G[:, free]).max(initial=0.0)
+    return left <= share * np.minimum(np.maximum(sizes, _LEAST * moved if moved else 1.0), 1.0)
 
 
 def _project(problem: GainProblem, N: np.ndarray, support: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 import systems
 from scipy import optimize
 
+import gsisio_jax as gx
 from gsisio_jax import Interval
 from gsisio_jax.design.assemble import Plan
 from gsisio_jax.design.feedthrough import factorise
@@ -149,3 +150,18 @@ def test_a_bank_holds_the_certified_gain_first_and_more_behind():
     np.testing.assert_allclose(one.gains.residual[0], many.gains.residual[0], atol=1e-12)
     with pytest.raises(ValueError, match="gains"):
         case.design(gains=0)
+
+
+def test_an_input_that_is_known_precisely_is_cancelled():
+    """Its sensor's noise is 10^-13 of the width of the state. A gain that left the input passed for one that cancels it
+    to rounding, in units of such boxes: of the input nothing would then be known, and the design was refused."""
+    system = gx.System(lambda x: 0.9 * x, lambda x: 0 * x, G=[[1.0]], H=[[1.0]])
+    noise = gx.Noise(gx.Interval.symmetric([1e4]), gx.Interval.symmetric([1e-9]))
+    observer = gx.design_observer(system, noise, gx.Interval.entire(1), missing=False, sweeps=1, window=1)
+    np.testing.assert_array_equal(observer.gains.residual[0], [[1, -1]])
+    np.testing.assert_allclose(observer.certificate.steady_width, 2e5)
+    d = np.array([1e9, -1e9, 3e8, 0.0])
+    x = np.concatenate([[0.0], [sum(0.9 ** (k - j) * d[j] for j in range(k + 1)) for k in range(3)]])[:, None]
+    state = gx.estimate(observer, gx.Interval([-1.0], [1.0]), d[:, None]).state
+    assert state.contains(x).all()
+    assert (state.width <= 2e5).all()
