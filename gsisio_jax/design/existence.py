@@ -66,15 +66,17 @@ def check_rank(problem: GainProblem) -> None:
 
 
 def null_direction(matrix: np.ndarray) -> np.ndarray | None:
-    """A unit vector that the matrix (rows of length about 1) sends to zero, or None."""
+    """A unit vector that the matrix (rows of length about 1) sends to zero, or None. Inputs may have any units."""
     columns = matrix.shape[1]
     if not len(matrix):
         return np.eye(columns)[0]
-    _, singular, right = np.linalg.svd(matrix)
+    size = np.linalg.norm(matrix, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    _, singular, right = np.linalg.svd(_rows(matrix / size))
     if len(singular) == columns and singular[-1] > _ZERO * singular[0]:
         return None
-    direction = right[-1]
-    direction = np.where(np.abs(direction) < 1e-12, 0.0, direction)
+    direction = np.where(np.abs(right[-1]) < 1e-12, 0.0, right[-1]) / size
+    direction = direction / np.linalg.norm(direction)
     return direction * np.sign(direction[np.abs(direction).argmax()])
 
 

@@ -50,9 +50,12 @@ def factorise(H: np.ndarray) -> Feedthrough:
     l, p = H.shape
     if p == 0 or not H.any():
         return Feedthrough(0, np.eye(l), np.zeros((p, 0)), np.eye(p), np.zeros((0, l)), "")
-    # Outputs may have very different units: judge the rank of H with its rows normalised.
-    norms = np.linalg.norm(H, axis=1, keepdims=True)
-    singular = np.linalg.svd(H / np.where(norms > 0, norms, 1.0), compute_uv=False)
+    # Outputs and inputs may have very different units: judge the rank of H with its rows and columns normalised.
+    scaled = H
+    for axis in (1, 0):
+        norms = np.linalg.norm(scaled, axis=axis, keepdims=True)
+        scaled = scaled / np.where(norms > 0, norms, 1.0)
+    singular = np.linalg.svd(scaled, compute_uv=False)
     rank = int((singular > _RANK_TOLERANCE * singular[0]).sum())
     T2, exact = _left_null_space(H, rank)
     note = ""

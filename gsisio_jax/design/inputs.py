@@ -8,6 +8,7 @@ linear program to be best at the steady width, row by row.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from gsisio_jax.design.problem import GainProblem, without_rounding
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.types import ExactInputs
 
+_APART = 1e8  # times as large as that of another one may be the effect of an input, before a solver mistakes the other
 MOST_SUPPORTS = 500  # basic left inverses per group of inputs that share rows; each costs time in every step
 
 
@@ -46,10 +48,13 @@ def _joint(problem: GainProblem, width: np.ndarray, complete: bool) -> LinearBou
     s = problem.columns - l - q
     direct, lifted = [], []
     if p:
-        direct = _distinct([_direct(problem, width, use_y) for use_y in (True, False)])
-        lifted = _distinct([_lifted(problem, width, *use) for use in product((True, False), repeat=2)])
+        unit = _units(problem)
+        inner = replace(problem, G=problem.G * unit, H=problem.H * unit, dd=problem.dd / unit[~problem.free])
+        direct = _distinct([_direct(inner, width, use_y) for use_y in (True, False)])
+        lifted = _distinct([_lifted(inner, width, *use) for use in product((True, False), repeat=2)])
         if not complete:  # where all basic rows are there, the pseudo-inverse adds nothing to them
-            direct = _distinct([*direct, _pseudo_inverse(problem)])
+            direct = _distinct([*direct, _pseudo_inverse(inner)])
+        direct, lifted = ([unit[:, None] * rows for rows in found] for found in (direct, lifted))
     else:
         direct = [np.zeros((0, n + l))]
     rows = []
@@ -81,6 +86,14 @@ def _exact(problem: GainProblem, width: np.ndarray) -> tuple[ExactInputs, str]:
         complete=inverses.complete and rings.complete,
     )
     return exact, "" if exact.complete else "input boxes are not exact: " + (inverses.note or rings.note)
+
+
+def _units(problem: GainProblem) -> np.ndarray:
+    """Powers of two (p,), in which inputs of very different units act alike; else 1."""
+    size = np.abs(np.vstack([problem.G, problem.H])).max(axis=0)
+    if size.max() <= _APART * size.min():
+        return np.ones(len(size))
+    return 2.0 ** -np.round(np.log2(size))
 
 
 def _direct(problem: GainProblem, width: np.ndarray, use_y: bool) -> np.ndarray | None:

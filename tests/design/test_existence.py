@@ -158,3 +158,19 @@ def test_rank_by_declaration_is_noted():
     assert np.abs(split.T2 @ H).max() < 1e-12
     assert factorise(np.zeros((3, 0))).rank == 0
     assert factorise(np.array([[0.0, 1.0], [0.0, 0.0], [0.0, 0.0]])).T2.tolist() == [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+@pytest.mark.parametrize("through", [False, True])
+def test_units_of_inputs_make_no_difference(through):
+    """One in units 10^16 times those of the other: it was said to be proved invisible, and with a feedthrough that the
+    measurements do not show it."""
+    A, G = np.array([[0.9, 0.1], [-0.2, 0.8]]), np.array([[1.0, 0.3], [0.2, 1.0]])
+    C = np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    H = np.array([[1.0, 1.0], [1.0, -1.0], [0.0, 0.0]]) * through
+    noise = gx.Noise(gx.Interval.symmetric([0.1, 0.1]), gx.Interval.symmetric([0.2, 0.2, 0.2]))
+    found = []
+    for unit in (np.ones(2), np.array([1e-8, 1e8])):
+        system = gx.System(lambda x: A @ x, lambda x: C @ x, G=G * unit, H=H * unit)
+        observer = gx.design_observer(system, noise, gx.Interval.entire(2), missing=False, sweeps=1, window=1)
+        found.append((observer.certificate.steady_width, observer.certificate.input_width * unit))
+    np.testing.assert_allclose(*found, rtol=1e-6)
