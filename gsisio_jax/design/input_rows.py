@@ -22,6 +22,7 @@ _DRAWN = 100  # samples for sums
 _MIDDLE = 4  # steps of a long block that are simulated beyond those with rows of their own
 _MOST_LAGS, _STRICTER = 64, 10  # steps that rows look back to, in all, for each input: twice as many for rates
 _ALONE = 2.5, 1 / 3  # as many of these, and as small a gain, where there is one input: its rows are few
+_LEAST_WIDTH = 1e-300  # without noise all may be points
 _NARROW = 0.05  # of the median width: boxes below count as wide as that where rows are chosen
 _MOST_ROWS, _LEAST_GAIN = 16, 3e-3  # of an input, and share of the width that one more row must bring
 
@@ -151,7 +152,7 @@ def _keep(
             continue
         up, down = np.full(len(size), FAR), np.full(len(size), FAR)
         # Where noise stands on its vertices the exact box may be a point, whose logarithm would be all that counts.
-        floor = _NARROW * float(np.median(above[:, places].min(1) + below[:, places].min(1)))
+        floor = max(_NARROW * float(np.median(above[:, places].min(1) + below[:, places].min(1))), _LEAST_WIDTH)
         for r in (r for r in places if r in kept):
             up, down = np.minimum(up, above[:, r]), np.minimum(down, below[:, r])
         for _ in range(min(_MOST_ROWS, len(places))):

@@ -278,7 +278,8 @@ def _solved(N_z: Any, Q: Any, form: AffineForm, slack: Any, C: Any, dtype: Any) 
     K = np.asarray(np.linalg.inv(plain), dtype)
     K = np.where(np.abs(K) < 1e-13 * np.abs(K).max(initial=0.0), 0, K)
     missed = rounded_up(exact(np.eye(n)) - exact(K).dot(A))
-    left = (missed + np.abs(np.float64(K)) @ (np.abs(N_z) @ slack + Q)) * _UP
+    with np.errstate(invalid="ignore"):  # where there is no bound: refused below
+        left = (missed + np.abs(np.float64(K)) @ (np.abs(N_z) @ slack + Q)) * _UP
     V = upper_inverse(left)
     return None if V is None else (K, left, V)
 

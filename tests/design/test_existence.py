@@ -174,3 +174,13 @@ def test_units_of_inputs_make_no_difference(through):
         observer = gx.design_observer(system, noise, gx.Interval.entire(2), missing=False, sweeps=1, window=1)
         found.append((observer.certificate.steady_width, observer.certificate.input_width * unit))
     np.testing.assert_allclose(*found, rtol=1e-6)
+
+
+def test_units_of_states_that_lie_far_apart_are_no_warning():
+    system = gx.System(
+        lambda x: jnp.array([[0.9, 1e-5], [-2e3, 0.8]]) @ x, lambda x: jnp.array([[1.0, 0.0], [1.0, 1e-4]]) @ x,
+        G=[[1.0], [2e3]], H=np.zeros((2, 1)),
+    )  # fmt: skip
+    noise = gx.Noise(gx.Interval.symmetric([0.1, 1e3]), gx.Interval.symmetric([0.2, 0.2]))
+    observer = gx.design_observer(system, noise, gx.Interval.entire(2), sweeps=1, window=1)
+    np.testing.assert_allclose(observer.certificate.steady_width, [0.4, 8e3], rtol=1e-6)

@@ -300,3 +300,11 @@ def test_where_no_row_helps_there_is_none(monkeypatch):
     noise = gx.Noise(Interval.symmetric([0.1]), Interval.symmetric([0.1]))
     found = gx.design_observer(system, noise, Interval.entire(1), missing=False, sweeps=1, window=1)
     assert found.input_rows is None
+
+
+def test_an_input_in_blocks_of_a_plant_without_noise():
+    """Boxes are points, and the logarithm of their width was a warning."""
+    system = gx.System(lambda x: 0.5 * x, lambda x: x, G=[[1.0]], H=[[0.0]], input_constant=2)
+    noise = gx.Noise(Interval.symmetric([0.0]), Interval.symmetric([0.0]))
+    observer = gx.design_observer(system, noise, Interval.entire(1), missing=False, sweeps=1, window=1)
+    assert (np.asarray(observer.certificate.steady_width) == 0).all()
