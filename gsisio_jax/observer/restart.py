@@ -67,10 +67,12 @@ def agreeing(maps: Maps, alone: Domain, y: Any, u: Any, noise: Noise) -> tuple[D
             gap = jnp.minimum(gap, less)
         return gap >= -tolerance, box
 
-    agree, boxes = zip(*map(of, sets), strict=True)
     disagree = alone.conflict
     if redundant:
         disagree = disagree | ~of(np.ones(system.l, bool))[0]
+    if not sets:  # so many outputs that even those without one of them are too many sets
+        return Domain(alone.box, tolerance, where(disagree, -jnp.inf, alone.gap), alone.margin, alone.source), y
+    agree, boxes = zip(*map(of, sets), strict=True)
     size = [where(ok, (seen & kept).sum(), -1) for ok, kept in zip(agree, sets, strict=True)]
     largest = jnp.stack(size).max()
     chosen = [(count == largest) & (largest >= 0) for count in size]

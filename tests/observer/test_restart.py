@@ -57,3 +57,23 @@ def test_where_several_sets_agree_their_hull_is_believed(run):
     assert est.state.contains(x).all()
     assert (np.asarray(est.state.width)[:, K].max(-1) > 8).all()
     assert np.isfinite(est.state.width).all()
+
+
+def test_more_outputs_than_sets_are_tried():
+    """21 outputs: even the sets without one of them are more than 20, so at a wrong one the state bounds are believed."""
+    n = 21
+    system = gx.System(
+        lambda x: 0.5 * x,
+        lambda x: x,
+        G=np.zeros((n, 0)),
+        H=np.zeros((n, 0)),
+        state_bounds=Interval.symmetric(np.ones(n)),
+    )
+    noise = gx.Noise(Interval.symmetric(np.full(n, 0.01)), Interval.symmetric(np.full(n, 0.1)))
+    observer = gx.design_observer(system, noise, system.state_bounds, window=1, missing=False, sweeps=1)
+    y = np.zeros((4, n))
+    y[1, 0] = 5.0
+    est = gx.estimate(observer, system.state_bounds, y)
+    assert [bool(status & Status.CONFLICT) for status in np.asarray(est.status)] == [False, True, False, False]
+    assert est.state.contains(np.zeros((4, n))).all()
+    assert (np.asarray(est.state.width)[2:] <= 0.2 + 1e-9).all()
