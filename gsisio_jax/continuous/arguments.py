@@ -29,6 +29,7 @@ class Arguments:
         drift: centre of the disturbance (n,), None where that is 0; spread: its radius (n,).
         region, u, d: boxes; empty ones where nothing was given.
         eps: of the floating type of the run.
+        never: box that the plant never leaves, with infinite sides where nothing is known; the region is met with it.
     """
 
     h: float
@@ -40,6 +41,7 @@ class Arguments:
     u: Sides
     d: Sides
     eps: float
+    never: Sides
 
     @property
     def n(self) -> int:
@@ -57,6 +59,7 @@ def read(
     input_bounds: Any,
     disturbance: Any,
     dtype: Any,
+    state_bounds: Any,
 ) -> Arguments:
     """All that can be judged without f.
 
@@ -68,16 +71,20 @@ def read(
     if matrix.ndim != 2 or matrix.shape[0] != n or not np.isfinite(matrix).all():
         raise ValueError(f"discretize: `G` must be a finite matrix of shape ({n}, p), got shape {matrix.shape}")
     for name, box, size in (("u_bounds", u_bounds, None), ("input_bounds", input_bounds, matrix.shape[1]),
-                            ("disturbance", disturbance, n)):  # fmt: skip
+                            ("disturbance", disturbance, n), ("state_bounds", state_bounds, n)):  # fmt: skip
         if box is not None:
             _sized(name, box, size)
     kind = jnp.result_type(float) if dtype is None else jnp.dtype(dtype)
     if not jnp.issubdtype(kind, jnp.floating):
         raise ValueError(f"discretize: `dtype` must be a floating type (float64, float32), got {dtype!r}")
     drift, spread = _disturbance(disturbance, n, kind)
+    never = sides.symmetric(np.full(n, np.inf)) if state_bounds is None else sides.sides(state_bounds)
+    start = sides.meet(sides.sides(region), never)
+    if not (start[0] <= start[1]).all():
+        raise ValueError(f"discretize: no state of `region` is in `state_bounds`: {region} and {state_bounds}")
     return Arguments(
-        _step(dt), _order(method, order), matrix, drift, spread, sides.sides(region), _or_none(u_bounds),
-        _or_none(input_bounds), float(jnp.finfo(kind).eps),
+        _step(dt), _order(method, order), matrix, drift, spread, start, _or_none(u_bounds),
+        _or_none(input_bounds), float(jnp.finfo(kind).eps), never,
     )  # fmt: skip
 
 
@@ -93,6 +100,8 @@ def check_bounded(method: str, given: Arguments, u_bounds: Any, input_bounds: An
             'nonlinear f is not known; give `input_bounds`, a box (p,), or use method="zoh" if f is affine'
         )
     for name, pair in (("region", given.region), ("u_bounds", given.u), ("input_bounds", given.d)):
+        if name == "region" and method != "zoh":  # states that f does not use, or in sines alone, need no bounds
+            continue
         if not np.isfinite(np.array(pair)).all():
             raise ValueError(
                 f"discretize: `{name}` must be finite for a bound, got {pair[0]} to {pair[1]}; or give bound=False"
@@ -105,13 +114,20 @@ def cells_of(region: Sides, cells: int | Sequence[int]) -> Iterator[Sides]:
     Raises:
         ValueError: `cells` is no number of parts, nor one for each state.
     """
-    n = len(region[0])
-    counts = [cells] * n if isinstance(cells, int | np.integer) else list(cells)
+    n, whole = len(region[0]), np.isfinite(region[0]) & np.isfinite(region[1])
+    counts = [cells if cut else 1 for cut in whole] if isinstance(cells, int | np.integer) else list(cells)
     if len(counts) != n or not all(isinstance(c, int | np.integer) and c >= 1 for c in counts):
         raise ValueError(
             f"discretize: `cells` must be a number of parts from 1 on, or one for each of the {n} states; got {cells!r}"
         )
-    edges = [np.linspace(low, high, count + 1) for low, high, count in zip(*region, counts, strict=True)]
+    if any(c > 1 for c, cut in zip(counts, whole, strict=True) if not cut):
+        raise ValueError(
+            f"discretize: `cells` cut states of which `region` is finite; got {cells!r}, {region[0]} to {region[1]}"
+        )
+    edges = [
+        np.linspace(low, high, count + 1) if count > 1 else np.array([low, high])
+        for low, high, count in zip(*region, counts, strict=True)
+    ]
     for place in itertools.product(*map(range, counts)):
         ends = [(edge[i], edge[i + 1]) for edge, i in zip(edges, place, strict=True)]
         yield np.array([low for low, _ in ends]), np.array([high for _, high in ends])

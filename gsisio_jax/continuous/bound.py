@@ -5,7 +5,7 @@ box, and ``F_1 = F, F_{k+1} = (dF_k/dx) F``, the time derivatives of a solution.
 step of length h:
 
 1. *Where the plant is.* A box E with ``X + [0, h] (F(E) + W - c)`` inside E holds every solution over the step (Picard
-   and Schauder; F is Lipschitz on E, which is checked).
+   and Schauder; F is Lipschitz on E, which is checked). Of a plant that never leaves B, met with B on both sides.
 2. *Without disturbance*: ``x(h) = x + sum_{k<=q} h^k/k! F_k(x) + h^{q+1}/(q+1)! r``, and r lies in the range of F_{q+1}
    on E, and in ``J F(E)`` where J encloses the difference quotients of F_q. All F_k up to q must be Lipschitz on E
    (finite J), kinks allowed.
@@ -35,23 +35,14 @@ import numpy as np
 
 from gsisio_jax import inclusion
 from gsisio_jax.continuous import maps, sides
+from gsisio_jax.continuous.enclosure import Around, box_text
 from gsisio_jax.continuous.exponential import integral_upper
 from gsisio_jax.continuous.field import Field
 from gsisio_jax.continuous.sides import Sides
 from gsisio_jax.scalar.numpy_program import numpy_function
 
-_ROUNDS, _TIGHTER = 40, 3
-_INFLATION = 0.1
-
-
-def _by_width(found: Sides, x: Sides) -> Sides:
-    more = _INFLATION * (found[1] - found[0]) + 1e-300
-    return more, more
-
-
-def _by_way(found: Sides, x: Sides) -> Sides:
-    """A part of the way that the plant moves beyond x, on either side."""
-    return _INFLATION * (x[0] - found[0]) + 1e-300, _INFLATION * (found[1] - x[1]) + 1e-300
+_LESS = 0.8  # of what the order at hand leaves out: then a lower one is named
+_WIDE = 0.01  # of the region
 
 
 @dataclass
@@ -63,6 +54,7 @@ class StepError:
         G: the discrete matrix of the unknown input, (n, p).
         spread: radius of the disturbance, (n,).
         eps: of the floating type of the run.
+        never: box that the plant never leaves, (n,); infinite sides where nothing is known.
     """
 
     field: Field
@@ -74,11 +66,12 @@ class StepError:
     d: Sides
     spread: np.ndarray
     eps: float
+    never: Sides
 
     def on(self, x: Sides) -> Sides:
         """What to add to w for starts in the box x."""
-        around = self.enclosure(x)
-        rate = self._rate(around)
+        around = self.around.of(x)
+        rate = self.around.rate(around)
         parts = [self._remainder(around, rate), self._rounding(x)]
         if self.field.p:
             parts.append(self._mismatch(x))
@@ -88,45 +81,42 @@ class StepError:
             parts.append(sides.symmetric(self._spreading(around)))
         return sides.add(*parts)
 
-    def enclosure(self, x: Sides) -> Sides:
-        """A box that holds every solution over a step that starts in x."""
-        try:
-            return self._enclosure(x, _by_width)
-        except ValueError:
-            # A tenth of a wide region may be far beyond what a short step can reach: where f has no bound, perhaps.
-            return self._enclosure(x, _by_way)
+    @cached_property
+    def left_by(self) -> dict[int, np.ndarray]:
+        """Width of what orders 1, 2, ... (keys 0, 1, ...) leave out without the unknown input, the largest of all boxes
+        so far: known besides."""
+        return {}
 
-    def _enclosure(self, x: Sides, more: Callable[[Sides, Sides], Sides]) -> Sides:
-        """That box, looked for in boxes that grow by `more` each time. Any one that passes the test is right."""
-        wide, around = sides.symmetric(self.spread), x
-        length = np.zeros(()), np.asarray(self.h)
-
-        def moved(around: Sides) -> Sides:
-            rate = sides.add(self._rate(around), wide)
-            if not np.isfinite(rate).all():
-                row = int(np.argwhere(~np.isfinite(rate).all(0))[0, 0])
-                raise ValueError(
-                    f"discretize: within a step of dt = {self.h:g} the plant may reach {box_text(around)}, where "
-                    f"f[{row}] has no finite bound; give a region on which f is defined, more cells, or a shorter dt"
+    def notes(self, error: Sides, region: Sides, cut: bool) -> tuple[str, ...]:
+        """What would make the bound smaller, where that is seen."""
+        width, found = error[1] - error[0], []
+        with np.errstate(all="ignore"):
+            ratios = {
+                k + 1: np.nanmax(left / self.left_by[self.order - 1], initial=0) for k, left in self.left_by.items()
+            }
+            best = min(ratios, key=lambda order: ratios[order])
+            if best < self.order and ratios[best] < _LESS and not self.runge_kutta:
+                found.append(
+                    f"order={best} leaves out less than order={self.order} (at most {ratios[best]:.2g} times as much): "
+                    "bounds of high derivatives on this region are wider than the powers of dt make up for"
                 )
-            return sides.add(x, sides.times(length, rate))
+            rows = np.flatnonzero(width > _WIDE * (region[1] - region[0]))
+        if len(rows):
+            states = ", ".join(str(row + 1) for row in rows)
+            found.append(
+                f"the error of one step is wider than a hundredth of the region in state {states}: a shorter dt, "
+                f"another order or a smaller region{'' if cut else ', or cells=4 or more,'} would make it smaller"
+            )
+        elif self.around.parts_pay and not cut:
+            found.append(
+                "f is bounded much better on parts of the region: cells=4 or more would make the error smaller"
+            )
+        return tuple(found)
 
-        for _ in range(_ROUNDS):
-            found = moved(around)
-            if sides.inside(found, around):
-                for _ in range(_TIGHTER):  # only to boxes that pass the same test
-                    image = moved(found)
-                    if not sides.inside(image, found):
-                        break
-                    around, found = found, image
-                return around
-            found = sides.hull([found, around])
-            below, above = more(found, x)
-            around = found[0] - below, found[1] + above
-        raise ValueError(
-            f"discretize: a step of dt = {self.h:g} is too long to enclose the plant on {box_text(x)} (boxes "
-            "kept growing); give a shorter dt, a smaller region, or more cells"
-        )
+    @cached_property
+    def around(self) -> Around:
+        """Where the plant is within a step, and how fast it moves there."""
+        return Around(self._rate, self.h, self.spread, self.never)
 
     def _rate(self, around: Sides) -> Sides:
         return self._range("rate", self.field.of_z, sides.joined(around, self.u, self.d))
@@ -171,6 +161,9 @@ class StepError:
     def _remainder(self, around: Sides, rate: Sides) -> Sides:
         q = self.order
         slopes = self._lipschitz(around)
+        for k in range(q):
+            left = sides.times(_share(self.h, k + 2), sides.apply((slopes[0][k], slopes[1][k]), rate))
+            self.left_by[k] = np.maximum(self.left_by.get(k, 0), left[1] - left[0])
         found = sides.apply((slopes[0][-1], slopes[1][-1]), rate)
         if not self.field.own_derivative:
             everything = sides.joined(around, self.u, self.d)
@@ -277,8 +270,3 @@ def _rough(k: int, q: int, where: Sides) -> str:
     )
     order = f"a method of order {q} needs it; " if k else "no step has a bound then; "
     return f"discretize: {what} is not Lipschitz on {box_text(where)}: {order}{remedy}"
-
-
-def box_text(pair: Sides) -> str:
-    """A box, in few digits."""
-    return f"[{', '.join(f'{v:.4g}' for v in pair[0])}] to [{', '.join(f'{v:.4g}' for v in pair[1])}]"

@@ -39,6 +39,7 @@ def discretize(
     order: int = 2,
     cells: int | Sequence[int] = 1,
     dtype: Any = None,
+    state_bounds: Interval | None = None,
 ) -> Discretization:
     """A discrete map for ``x' = f(x, u) + G d + w(t)``, and a guaranteed bound of what it leaves out in a step.
 
@@ -54,7 +55,8 @@ def discretize(
         method: "taylor" (derivatives of f along the solution, error of order dt^(order + 1)), "euler" (order dt^2, the
             only one that allows kinks in f), "rk4" (order dt^5; its bound is looser than that of "taylor", 5 to 100
             times the error) or "zoh" (exact; f must be affine in x and u, wherever the plant may be within a step).
-        region: box (n,) of states at the start of a step for which the bound is to hold.
+        region: box (n,) of states at the start of a step for which the bound is to hold. Infinite sides are allowed
+            where f is bounded all the same: states that it does not use (a position), or in sines alone (a heading).
         bound: False gives the map alone.
         u_bounds: box (m,) of known inputs for which the bound is to hold. Needed where f takes u.
         G: how the unknown input d enters the vector field, shape (n, p); none if not given.
@@ -67,6 +69,9 @@ def discretize(
             bound is tighter, and takes as many times longer as there are parts.
         dtype: floating type in which the observer will run, whose rounding of the method's coefficients is part of the
             bound; JAX's default type if not given.
+        state_bounds: box (n,) that the plant never leaves, whatever u, d and w(t) within their bounds (concentrations
+            are not negative); sides may be infinite. It need not be tight, and f need not be defined beyond it;
+            `Discretization.system` hands it on.
 
     Returns:
         Discretization: f, error, G, and methods that make a `System` and a `Noise` of it.
@@ -82,7 +87,7 @@ def discretize(
 
     Source: theory 15; the error is a Taylor remainder on an a-priori enclosure, see Moore, *Interval Analysis*, 1966.
     """
-    given = read(dt, method, order, region, u_bounds, G, input_bounds, disturbance, dtype)
+    given = read(dt, method, order, region, u_bounds, G, input_bounds, disturbance, dtype, state_bounds)
     with _named():
         takes = takes_u(f, "f", None if u_bounds is None else u_bounds.shape[0])[0]
     if takes and u_bounds is None:
@@ -94,13 +99,24 @@ def discretize(
         field = Field(f, takes, given.n, len(given.u[0]), given.G, given.drift)
         with _named():
             check_map("f", field.alone, given.n, given.n, field.m)
-        found, matrix, error = (_held if method == "zoh" else _stepped)(field, given, method, bound, cells)
+        found, matrix, error, notes = (_held if method == "zoh" else _stepped)(field, given, method, bound, cells)
     if error is not None and not np.isfinite(error).all():
         raise ValueError(
             "discretize: no finite bound of the error was found on this region; give a smaller one, or a shorter dt"
         )
     box, kept = None if error is None else Interval(*error), None if G is None else matrix
-    return Discretization(found, box, kept, given.h, method, region, u_bounds if takes else None, input_bounds)
+    return Discretization(
+        found,
+        box,
+        kept,
+        given.h,
+        method,
+        region,
+        u_bounds if takes else None,
+        input_bounds,
+        state_bounds,
+        notes,
+    )
 
 
 @contextmanager
@@ -114,7 +130,7 @@ def _named() -> Iterator[None]:
 
 def _stepped(
     field: Field, given: Arguments, method: str, bound: bool, cells: int | Sequence[int]
-) -> tuple[Any, np.ndarray, Sides | None]:
+) -> tuple[Any, np.ndarray, Sides | None, tuple[str, ...]]:
     """Map, discrete G and error of a method that steps along the field."""
     if method != "euler" and field.own_derivative:
         raise ValueError(
@@ -125,16 +141,26 @@ def _stepped(
     found = partial(maps.of_x_and_u if field.takes_u else maps.of_x, step, field.f, given.drift, given.h)
     matrix = _input_matrix(field, given)
     if not bound:
-        return found, matrix, None
+        return found, matrix, None, ()
     terms = StepError(
-        field, given.h, given.order, method == "rk4", matrix, given.u, given.d, given.spread, given.eps
+        field, given.h, given.order, method == "rk4", matrix, given.u, given.d, given.spread, given.eps, given.never
     )  # fmt: skip
-    return found, matrix, sides.hull([terms.on(cell) for cell in cells_of(given.region, cells)])
+    parts = list(cells_of(given.region, cells))
+    try:
+        error = sides.hull([terms.on(cell) for cell in parts])
+    except ValueError:
+        if np.isfinite(np.array(given.region)).all():
+            raise
+        raise ValueError(
+            "discretize: `region` must be finite for a bound, but in states that f does not use or in sines alone, got "
+            f"{given.region[0]} to {given.region[1]}; or give bound=False"
+        ) from None
+    return found, matrix, error, terms.notes(error, given.region, len(parts) > 1)
 
 
 def _held(
     field: Field, given: Arguments, method: str, bound: bool, cells: int | Sequence[int]
-) -> tuple[Any, np.ndarray, Sides | None]:
+) -> tuple[Any, np.ndarray, Sides | None, tuple[str, ...]]:
     """The exact step of an affine field. An input without a bound is multiplied by the numbers of G as they are, as
     everywhere in this library; so the box of d is 0 in the error of rounding where there is none."""
     inputs = given.d if len(given.d[0]) else sides.symmetric(np.zeros(field.p))
@@ -145,9 +171,10 @@ def _held(
                 'discretize: method="zoh" needs an f that is affine everywhere where an unknown input has no bound, as '
                 "it can take the state anywhere within a step; f is affine on the region alone. Give `input_bounds`"
             )
-        return StepError(
-            field, given.h, 1, False, given.h * field.G, given.u, given.d, given.spread, given.eps
-        ).enclosure(given.region)  # fmt: skip
+        terms = StepError(
+            field, given.h, 1, False, given.h * field.G, given.u, given.d, given.spread, given.eps, given.never
+        )
+        return terms.around.of(given.region)
 
     of_field = affine(field, given.region, given.u, reach if bound else None)
     A, c = of_field.A, of_field.c
@@ -157,10 +184,10 @@ def _held(
     else:
         found = partial(maps.affine_of_x, parts[0], parts[3][:, 0])
     if not bound:
-        return found, parts[2], None
+        return found, parts[2], None, ()
     around = sides.joined(given.region, given.u, inputs, sides.symmetric(np.ones(1)))
     eps = 0.0 if given.eps <= np.finfo(np.float64).eps else given.eps
-    return found, parts[2], hold_error(A, parts, lost, around, given.spread + of_field.rest, given.h, eps)
+    return found, parts[2], hold_error(A, parts, lost, around, given.spread + of_field.rest, given.h, eps), ()
 
 
 def _input_matrix(field: Field, given: Arguments) -> np.ndarray:
@@ -168,7 +195,10 @@ def _input_matrix(field: Field, given: Arguments) -> np.ndarray:
     term, total = field.G, given.h * field.G
     if not field.p or given.order == 1:
         return total
-    x, u = (np.asarray(sides.box(pair).center) for pair in (given.region, given.u))
+    low, high = given.region
+    whole = np.isfinite(low) & np.isfinite(high)
+    region = np.where(whole, given.region, np.clip(0.0, low, high))  # an infinite side has no centre
+    x, u = (np.asarray(sides.box(pair).center) for pair in ((region[0], region[1]), given.u))
     A = np.asarray(jax.jacfwd(field.known)(x, u))
     for k in range(2, given.order + 1):
         term = A @ term

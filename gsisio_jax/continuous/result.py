@@ -33,6 +33,8 @@ class Discretization:
         region: box (n,) of states at the start of a step for which `error` holds.
         u_bounds: box (m,) of known inputs for which it holds; None where f takes none.
         input_bounds: box (p,) of unknown inputs for which it holds; None where it needs none.
+        state_bounds: box (n,) that the plant was said never to leave; None where nothing was said.
+        notes: what would make `error` smaller, where the bound shows it.
     """
 
     f: Callable[..., Any]
@@ -43,9 +45,12 @@ class Discretization:
     region: Interval
     u_bounds: Interval | None = None
     input_bounds: Interval | None = None
+    state_bounds: Interval | None = None
+    notes: tuple[str, ...] = ()
 
     def system(self, g: Callable[..., Any], H: Any = None, **options: Any) -> System:
-        """The plant with the output map g; `f`, `G`, `input_bounds` and the number of known inputs are filled in.
+        """The plant with the output map g; `f`, `G`, `input_bounds`, `state_bounds` and the number of known
+        inputs are filled in.
 
         Args:
             g: output map of x (n,) or (x, u); returns (l,).
@@ -61,8 +66,9 @@ class Discretization:
         G = np.zeros((n, 0)) if self.G is None else self.G
         if H is None:
             H = np.zeros((_outputs(g, n, m), G.shape[1]))
-        if self.input_bounds is not None:
-            options.setdefault("input_bounds", self.input_bounds)
+        for name, box in (("input_bounds", self.input_bounds), ("state_bounds", self.state_bounds)):
+            if box is not None:
+                options.setdefault(name, box)
         return System(self.f, g, G=G, H=H, m=m, **options)
 
     def noise(self, v: Interval, w: Interval | None = None) -> Noise:

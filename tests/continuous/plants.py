@@ -38,6 +38,12 @@ def motor(x, u):
     return jnp.stack([x[1], -2.0 * x[0] - 0.5 * x[1] + 3.0 * u[0]])
 
 
+def reactor(x, u):
+    """Biomass and substrate, growth with inhibition: a pole at a substrate below 0, which an enclosure soon reaches."""
+    growth = 0.4 * x[1] / (0.5 + x[1] + x[1] ** 2 / 20) * x[0]
+    return jnp.stack([growth - u[0] * x[0], -2 * growth - u[0] * x[1]])
+
+
 @dataclass
 class Case:
     """Arguments of `gx.discretize`, and how the plant is driven."""
@@ -61,6 +67,8 @@ SWING, ATTRACTOR = _box(-1, 1, -2, 2), _box(-15, 15, -20, 20, 5, 40)
 LEVELS, FLOW = {"u_bounds": _box(0.2, 0.5)}, _box(1, 4, 1, 4)
 PUSHED = {"G": [[0.0], [1.0]], "input_bounds": _box(-2, 3)}
 SHAKEN = {"disturbance": _box(-0.02, 0.05, -0.5, 0.3)}
+NOT_NEGATIVE = Interval(np.zeros(2), np.full(2, np.inf))
+FED = {"u_bounds": _box(0, 0.4), "G": [[0.0], [1.0]], "input_bounds": _box(0, 6), "state_bounds": NOT_NEGATIVE}
 CASES = {
     "pendulum, Euler": Case(pendulum, 0.01, "euler", SWING, most=1.2),
     "pendulum, Taylor": Case(pendulum, 0.01, "taylor", SWING, most=1.8),
@@ -75,6 +83,7 @@ CASES = {
     "tanks, Taylor": Case(tanks, 0.1, "taylor", FLOW, LEVELS, most=6),
     "tanks, Runge-Kutta": Case(tanks, 0.1, "rk4", FLOW, LEVELS),
     "drag, Euler": Case(drag, 0.02, "euler", _box(-1, 1, -3, 3), most=2.5),
+    "reactor, Euler, cells": Case(reactor, 0.1, "euler", _box(1, 8, 0.05, 6), {**FED, "cells": [2, 4]}, most=16),
     "motor, hold": Case(motor, 0.1, "zoh", SWING, {"u_bounds": _box(-1, 1), **PUSHED}),
     "motor, hold, shaken": Case(motor, 0.1, "zoh", SWING, {"u_bounds": _box(-1, 1), **PUSHED, **SHAKEN}, most=1.5),
 }

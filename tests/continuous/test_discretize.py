@@ -172,6 +172,39 @@ def test_the_map_compares_pickles_and_watches_the_field():
         watched.check_unchanged("estimate")
 
 
+def decay(x):  # substrate that is used up, with a pole below 0
+    return -8 * x / (0.5 + x + x**2 / 20)
+
+
+def test_bounds_that_the_plant_never_leaves_keep_the_enclosure_off_a_pole():
+    region, limits = Interval([0.05], [6.0]), Interval([0.0], [np.inf])
+    with pytest.raises(ValueError, match=r"has no finite bound; .* `state_bounds` that the plant never leaves"):
+        gx.discretize(decay, 0.1, "euler", region=region)
+    model, euler = (gx.discretize(decay, 0.1, region=region, state_bounds=limits, order=order) for order in (2, 1))
+    assert model.system(lambda x: x).state_bounds is limits
+    lower, wide = model.notes
+    assert lower.startswith("order=1 leaves out less than order=2 (at most 0.")
+    assert "wider than a hundredth of the region in state 1: " in wide
+    assert "cells=4" in wide
+    assert (np.asarray(euler.error.width) < 0.8 * np.asarray(model.error.width)).all()
+
+
+def test_states_that_f_does_not_use_or_in_sines_alone_need_no_finite_region():
+    def car(x):  # position, heading, speed
+        return jnp.stack([x[2] * jnp.cos(x[1]), 0.1 * x[2], -0.05 * x[2]])
+
+    def model(method, far, round):
+        return gx.discretize(
+            car, 0.1, method, region=Interval([-far, -round, 0], [far, round, 30]), G=[[0], [0], [1]],
+            input_bounds=Interval([-3.0], [2.0]), cells=2,
+        )  # fmt: skip
+
+    endless, wide = model("euler", np.inf, np.inf), model("euler", 1e3, 7.0)
+    np.testing.assert_allclose(endless.error.width, wide.error.width, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(endless.G, wide.G)
+    assert endless.holds(Interval([[-1e9, 50.0, 1.0]] * 2, [[1e9, 60.0, 2.0]] * 2)).all()
+
+
 def test_equal_operations_are_done_once():
     def function(x):
         return jnp.sin(x) * x + jax.jit(jnp.sin)(x) + x * jnp.sin(x)
@@ -193,6 +226,14 @@ WRONG = {
     "infinite region": (
         lambda: gx.discretize(plants.pendulum, 0.1, region=Interval.entire(2)),
         "`region` must be finite for a bound",
+    ),
+    "region beyond bounds": (
+        lambda: gx.discretize(plants.pendulum, 0.1, region=SWING, state_bounds=Interval([3.0, 0.0], [4.0, 1.0])),
+        "no state of `region` is in `state_bounds`",
+    ),
+    "cells of no end": (
+        lambda: gx.discretize(lambda x: jnp.sin(x), 0.1, region=Interval.entire(1), cells=[2]),
+        "`cells` cut states of which `region` is finite",
     ),
     "unbounded input": (
         lambda: gx.discretize(plants.pendulum, 0.1, region=SWING, G=[[0.0], [1.0]]),
