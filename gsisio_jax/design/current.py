@@ -12,6 +12,7 @@ from gsisio_jax.design.assemble import Plan, assemble
 from gsisio_jax.design.cells import with_cells
 from gsisio_jax.design.dead_beat import dead_beat_rows
 from gsisio_jax.design.delay import with_delay
+from gsisio_jax.design.delay_gain import what_a_delay_gives
 from gsisio_jax.design.existence import check_existence
 from gsisio_jax.design.feedthrough import factorise
 from gsisio_jax.design.first_gain import first_gain
@@ -176,6 +177,9 @@ def design_current(
         observer = replace(observer, recovery=rows_alone)
     if window == "auto" and observer.window is None:
         observer = replace(observer, certificate=observer.certificate.with_notes(what_windows_may_give(observer)))
+    if dials.certify and not dials.tolerate:
+        way = what_a_delay_gives(plan, observer.certificate, box)
+        observer = replace(observer, certificate=observer.certificate.with_notes(way))
     say("bounding what rounding leaves")
     observer = finished(observer)
     if dials.cells != 1:

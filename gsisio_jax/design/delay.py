@@ -72,14 +72,14 @@ def design_delayed(
     if not delay:
         return design(system, noise, False)
     plant = lifted(system, delay)
-    inner = design(plant, _noise_of(plant, noise), True)
+    inner = design(plant, noise_of(plant, noise), True)
     fuller = _with_more(system, plant, inner, noise, u_region, delay)
     if fuller is not None:
         with contextlib.suppress(NoDesignFound):
-            found = design(fuller, _noise_of(fuller, noise), False)
+            found = design(fuller, noise_of(fuller, noise), False)
             if (found.certificate.steady_width <= inner.certificate.steady_width * (1 + _EQUAL)).all():
                 return _delayed(found, system, noise, u_region, delay)
-    return _delayed(design(plant, _noise_of(plant, noise), False), system, noise, u_region, delay)
+    return _delayed(design(plant, noise_of(plant, noise), False), system, noise, u_region, delay)
 
 
 def _with_more(
@@ -189,7 +189,7 @@ def _rows(plant: System) -> LiftedRows:
     return lift.rows(np.float64)
 
 
-def _noise_of(plant: System, noise: Noise) -> Noise:
+def noise_of(plant: System, noise: Noise) -> Noise:
     """Bounds of the noise of the lifted plant, for the design."""
     rows = _rows(plant)
     steps = rows.outputs.shape[1] // noise.v.shape[0]

@@ -250,3 +250,21 @@ def test_results_say_so(spring, record):
     assert "up to step k + 1" in data.attrs["comment"]
     assert "y[0..k+1]" in str(spring.certificate)
     assert "up to 1 step later" in gx.plot.framers(est)[0].figure.get_suptitle() + gx.plot.framers(est)[0].get_title()
+
+
+def test_where_state_bounds_alone_make_an_observer_the_certificate_names_the_delay():
+    """Infections of which nothing is known move the exposed, who fall ill later."""
+    noise = gx.Noise(Interval.symmetric([1.0, 1.0]), Interval.symmetric([5.0]))
+    system = gx.System(
+        lambda x: np.array([[0.8, 0.0], [0.2, 0.9]]) @ x, lambda x: x[1:], G=[[1.0], [0.0]], H=[[0.0]],
+        state_bounds=Interval([0.0, 0.0], [1e6, 1e6]),
+    )  # fmt: skip
+    dials = {"missing": False, "window": 1, "sweeps": 1}
+    now, late = (gx.design_observer(system, noise, system.state_bounds, delay=delay, **dials) for delay in (0, 1))
+    (note,) = now.certificate.notes
+    width = late.certificate.steady_width[0]
+    assert now.certificate.steady_width[0] == 1e6
+    assert width < 200
+    assert note.startswith("of state 1 no more is promised than the state bounds")
+    assert f"delay=1 promises a width of {width:.4g} of state 1" in note
+    assert not any("no more" in one for one in late.certificate.notes)

@@ -60,7 +60,7 @@ def test_where_several_sets_agree_their_hull_is_believed(run):
 
 
 def test_more_outputs_than_sets_are_tried():
-    """21 outputs: even the sets without one of them are more than 20, so at a wrong one the state bounds are believed."""
+    """21 outputs: even the sets without one of them are more than 20, so a wrong one leaves the state bounds."""
     n = 21
     system = gx.System(
         lambda x: 0.5 * x,
