@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 from functools import partial
 from pathlib import Path
@@ -47,6 +48,7 @@ class SignalsPart(Part):
 class RegionPart(Part):
     """The box the gain is designed for, or ``auto = true``, around a state, a box, or the initial one."""
 
+    use: Reference | None = None
     auto: bool = False
     around: list[Number] | Bounds | Literal["initial"] | None = None
     lower: list[Number] | None = None
@@ -56,7 +58,10 @@ class RegionPart(Part):
     def _check(self) -> RegionPart:
         if self.around is not None and not self.auto:
             raise ValueError("around says where auto = true looks; leave it out, or lower and upper")
-        if not self.auto:
+        if self.use is not None:
+            if self.auto or (self.lower, self.upper) != (None, None):
+                raise ValueError("give either use, or auto = true, or lower and upper, not several of them")
+        elif not self.auto:
             check_box(self.lower, self.upper, "needs both lower and upper, or auto = true")
         elif self.lower is not None or self.upper is not None:
             raise ValueError("give either auto = true or lower and upper, not both")
@@ -132,6 +137,15 @@ class Config(Part):
     monte_carlo: MonteCarloPart | None = None
 
 
+def _bare_point(path: Path) -> str:
+    """Of a file that is no TOML: a number such as ``50.`` or ``.5``, which Python knows and TOML does not."""
+    for number, line in enumerate(path.read_text("utf-8", "replace").splitlines(), start=1):
+        bare = re.search(r"[=\[,\s][+-]?(\d+\.(?![\d.])|\.\d+)", re.sub(r"\"[^\"]*\"|'[^']*'|#.*", "", line))
+        if bare is not None:
+            return f"; line {number} has {bare[0][1:]}, and a number needs digits on both sides of the point: 50.0, 0.5"
+    return ""
+
+
 def read_config(path: Path) -> Config:
     """Read and check a configuration file.
 
@@ -144,7 +158,7 @@ def read_config(path: Path) -> Config:
     except OSError as error:
         raise UserError(f"{path}: cannot read the configuration: {reason(error)}") from error
     except tomllib.TOMLDecodeError as error:
-        raise UserError(f"{path.name}: not valid TOML: {reason(error)}") from error
+        raise UserError(f"{path.name}: not valid TOML: {reason(error)}{_bare_point(path)}") from error
     except UnicodeDecodeError as error:
         raise UserError(f"{path.name}: not valid TOML: the file is not UTF-8 text") from error
     check_filled_in(raw, path)

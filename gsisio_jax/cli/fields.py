@@ -58,8 +58,9 @@ def check_box(lower: list[float] | None, upper: list[float] | None, needs: str) 
 
 
 class Bounds(Part):
-    """A box: either ``radius`` (symmetric) or ``lower`` and ``upper``."""
+    """A box: either ``radius`` (symmetric) or ``lower`` and ``upper``, or one that a module holds (``use``)."""
 
+    use: Reference | None = None
     radius: list[Number] | None = None
     lower: list[Number] | None = None
     upper: list[Number] | None = None
@@ -78,7 +79,10 @@ class Bounds(Part):
 
     @model_validator(mode="after")
     def _check(self) -> Bounds:
-        if self.radius is None:
+        if self.use is not None:
+            if (self.radius, self.lower, self.upper) != (None, None, None):
+                raise ValueError("give either use, or radius, or lower and upper, not several of them")
+        elif self.radius is None:
             check_box(self.lower, self.upper, "needs radius, or both lower and upper")
         elif self.lower is not None or self.upper is not None:
             raise ValueError("give either radius or lower and upper, not both")

@@ -36,7 +36,8 @@ in their own --help):
   input = [{name = "leak", unit = "l/s"}]  # likewise output, known_input
   [noise]                            # bounds of the process noise w and of the measurement noise v
   w = {radius = [0.01]}              # every box is {radius = [...]} or {lower = [...], upper = [...]},
-  v = {radius = [0.1]}               # one number for each component; inf where nothing is known
+  v = {radius = [0.1]}               # one number for each component, inf where nothing is known; or
+                                     # {use = "module:attribute"}, a gx.Interval: model.error of gx.discretize, say
   [region]                           # of states, for which gains are chosen and widths promised:
   lower = [-1.0]                     # lower and upper, or
   upper = [1.0]                      # auto = true and around = a state [...], a box, or "initial"

@@ -87,12 +87,16 @@ class Labelled:
             dataset[f"measured_{problem.output.names[output]}"].attrs["measures"] = problem.state.names[state]
         if self._totals.zone is not None:
             # The numbers stay seconds; pictures show what they stand for.
-            dataset["time"].attrs |= {"long_name": "time since 1970-01-01 00:00 UTC", "epoch": EPOCH}
-            dataset["time"].attrs |= {"zone": self._totals.zone} if self._totals.zone else {}
+            dataset["time"].attrs |= date_attributes(self._totals.zone)
         dataset.attrs["alarms"] = json.dumps(self._totals.alarms, ensure_ascii=False)
         if self._totals.alarm_count > len(self._totals.alarms):
             dataset.attrs["alarm_count"] = self._totals.alarm_count
         return dataset
+
+
+def date_attributes(zone: str) -> dict[str, str]:
+    """Of a time in seconds since 1970 that stands for dates of a zone, "" where they have none."""
+    return {"long_name": "time since 1970-01-01 00:00 UTC", "epoch": EPOCH} | ({"zone": zone} if zone else {})
 
 
 def measured_states(system: Any) -> dict[int, int]:

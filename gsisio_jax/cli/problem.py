@@ -76,6 +76,22 @@ def resolve(reference: str, key: str) -> Any:
     return found
 
 
+def used_box(reference: str, key: str, size: int, of: str) -> Interval:
+    """The box that ``module:attribute`` names: of a plant that is discretised the bound of what that leaves out, say.
+
+    Raises:
+        UserError: it is no box, or one of another size.
+    """
+    found = resolve(reference, key)
+    if not isinstance(found, Interval):
+        raise UserError(f"{key}: {reference} must be a gsisio_jax.Interval, got {type(found).__name__}")
+    if found.shape != (size,):
+        raise UserError(
+            f"{key}: {reference} has the shape {found.shape}, and ({size},) is needed: one for each of the {of}"
+        )
+    return found
+
+
 def build_problem(config: Config, file: str) -> Problem:
     """Build system, noise and boxes, and check every list of the file against the size of the system.
 
@@ -98,6 +114,8 @@ def build_problem(config: Config, file: str) -> Problem:
             )
 
     def box(key: str, bounds: Bounds, what: str) -> Any:
+        if bounds.use is not None:
+            return used_box(bounds.use, f"{file}: {key}.use", sizes[what], what)
         if bounds.radius is not None:
             check(f"{key}.radius", bounds.radius, what)
             return Interval.symmetric(bounds.radius)
@@ -124,7 +142,8 @@ def build_problem(config: Config, file: str) -> Problem:
     if config.region.auto:
         region: Any = "auto"
     else:
-        region = box("region", Bounds(lower=config.region.lower, upper=config.region.upper), "states")
+        whole = config.region
+        region = box("region", Bounds(use=whole.use, lower=whole.lower, upper=whole.upper), "states")
     around = config.region.around
     if around == "initial":
         around = box("initial", config.initial, "states")

@@ -13,6 +13,7 @@ from .._extras import need
 from ..errors import ContainmentLost
 from .config import Config
 from .errors import UserError
+from .labelled import date_attributes
 from .output import check_writable, write_all
 from .problem import Problem, build_problem, importable
 from .progress import DelayedProgress
@@ -62,7 +63,10 @@ def sweep(options: Namespace, path: Path, config: Config) -> int:
             import gsisio_jax as gx
 
             wanted = {"initial": initial, "y": records.y, "u": records.u, "length": records.length}
-            return gx.sweep(observer, **wanted, time=records.time, **shared)
+            dataset = gx.sweep(observer, **wanted, time=records.time, **shared)
+            if records.zone is not None and "time" in dataset.coords:
+                dataset["time"].attrs |= date_attributes(records.zone)
+            return dataset
 
         return part, records.steps, records.measured, call
 

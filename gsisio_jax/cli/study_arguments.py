@@ -17,8 +17,9 @@ from ..plant.system import Noise
 from ..study import grid
 from .config import Config
 from .errors import UserError, reason
+from .fields import Bounds
 from .logs import Table, TablePart, read_table
-from .problem import Problem, resolve
+from .problem import Problem, resolve, used_box
 from .study_config import AxesPart, MonteCarloPart
 
 NOISE = {"both": "noise_scale", "w": "process_noise_scale", "v": "measurement_noise_scale"}
@@ -74,7 +75,7 @@ def initial_of(problem: Problem, axes: AxesPart, key: str) -> Any:
 class Records:
     """What `sweep` is given of the measurements: with the axis "record" where files are listed.
 
-    `measured` of the `steps` have a measurement, on average over the records.
+    `measured` of the `steps` have a measurement, on average over the records. `zone` of dates as in `Table`.
     """
 
     y: Any
@@ -83,6 +84,7 @@ class Records:
     time: np.ndarray | None
     steps: int
     measured: float
+    zone: str | None = None
 
 
 def read_records(wanted: TablePart, patterns: str | list[str] | None, folder: Path, file: str) -> Records:
@@ -100,7 +102,7 @@ def read_records(wanted: TablePart, patterns: str | list[str] | None, folder: Pa
 
     if patterns is None or (isinstance(patterns, str) and (folder / patterns).is_file()):
         table = read(folder / (patterns or wanted.file))
-        return Records(table.y, table.u, None, table.time, len(table.y), _measured(table))
+        return Records(table.y, table.u, None, table.time, len(table.y), _measured(table), table.zone)
     paths = _matching([patterns] if isinstance(patterns, str) else patterns, folder, file)
     tables = [read(folder / path) for path in paths]
     lengths = np.array([len(table.y) for table in tables])
@@ -181,6 +183,9 @@ def _first_states(part: MonteCarloPart, problem: Problem, initial: Any, file: st
             raise UserError(f"{file}: the initial box is not bounded; give monte_carlo.x0, from which states are drawn")
         return Interval(lower[smallest], upper[smallest])
     bounds = part.x0
+    if bounds.use is not None:
+        used = used_box(bounds.use, f"{file}: monte_carlo.x0.use", problem.system.n, "states")
+        bounds = Bounds(lower=np.asarray(used.lower).tolist(), upper=np.asarray(used.upper).tolist())
     of = len(bounds.radius if bounds.radius is not None else bounds.lower or [])
     if of != problem.system.n:
         raise UserError(f"{file}: monte_carlo.x0 has {of} values, the system has {problem.system.n} states")

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gsisio_jax._moments import EPOCH, zone_name
+from gsisio_jax.dataset import zone_of_dates
 from gsisio_jax.interval.reading import read_array
 from gsisio_jax.observer.status import flag_attributes
 from gsisio_jax.plant.system import System
@@ -23,6 +25,7 @@ class Labels(NamedTuple):
     units: dict[str, list[str] | None]
     time: np.ndarray | None
     steps: int
+    clock: dict[str, str]  # attributes of the time
 
     @classmethod
     def of(
@@ -54,11 +57,20 @@ class Labels(NamedTuple):
                     raise ValueError(
                         f"{call}: `{kind}_{what}` has {len(values)} entries, the system has {count}; give one for each"
                     )
+        clock = {"long_name": "time", "units": "s"}
         if time is not None:
+            if getattr(getattr(time, "dtype", None), "kind", "") == "M":
+                # A store holds numbers; pictures show what they stand for.
+                zone = zone_of_dates(time)
+                clock |= {"epoch": EPOCH} | ({} if zone is None else {"zone": zone_name(zone)})
+                dates = np.asarray(time, dtype="datetime64[ns]")  # of a zone: in UTC
+                time = np.where(np.isnat(dates), np.nan, dates.astype(np.int64) / 1e9)
+                if np.isnan(time).any():
+                    raise ValueError(f"{call}: `time` has no date in row {int(np.argmax(np.isnan(time)))}")
             time = np.asarray(read_array(call, "time", time), dtype=np.float64)
             if time.shape != (steps,):
                 raise ValueError(f"{call}: `time` must have shape ({steps},), one per step; got {time.shape}")
-        return cls(names, units, time, steps)
+        return cls(names, units, time, steps, clock)
 
     def unit(self, of: str) -> dict[str, Any]:
         """Attributes that say the unit; signals of different units have it as the coordinate ``<signal>_unit``."""
@@ -100,8 +112,6 @@ def coordinates_of(
     if any("time" in dims for _, _, dims, _ in variables.values()):
         step = np.arange(labels.steps, dtype=np.float64)
         coordinates["time"] = (
-            ("time", step, {"long_name": "step"})
-            if labels.time is None
-            else ("time", labels.time, {"long_name": "time", "units": "s"})
+            ("time", step, {"long_name": "step"}) if labels.time is None else ("time", labels.time, labels.clock)
         )
     return coordinates

@@ -83,7 +83,9 @@ def sweep(
         mesh: a ``jax.sharding.Mesh`` of local devices over which the cases of a tile are spread.
         state_names: n names; ``x1, x2, ...`` where left out. Likewise `input_names` (``d1, ...``).
         state_units: n units. Likewise `input_units`.
-        time: (T,) seconds, labels of the rows for ``reduce=None``; the step number where left out.
+        time: (T,) seconds, labels of the rows for ``reduce=None``; or dates, as a ``pandas.DatetimeIndex`` or
+            ``datetime64`` of NumPy: numbers are then seconds since 1970, and pictures show dates. The step number where
+            left out.
         title: attribute ``title``.
         rounding: as in `estimate`; attribute ``guaranteed`` says whether the boxes hold on the machine.
 

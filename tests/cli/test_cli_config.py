@@ -21,6 +21,22 @@ CASES = {
         "w = 0.01",
         ["noise.w: must be a box, got 0.01", "radius = [0.01]"],
     ),
+    "box of a module": (
+        "w = {radius = [0.001, 0.001]}",
+        'w = {use = "cart_model:STEP"}',
+        ["cart.toml: noise.w.use: cart_model:STEP must be a gsisio_jax.Interval, got float"],
+    ),
+    "box of a module and numbers": (
+        "w = {radius = [0.001, 0.001]}",
+        'w = {use = "cart_model:STEP", radius = [1, 1]}',
+        ["noise.w: give either use, or radius"],
+    ),
+    "region of a module and numbers": (
+        "[region]",
+        '[region]\nuse = "cart_model:STEP"',
+        ["region: give either use, or auto"],
+    ),
+    "bare point": ("sample_time = 0.1", "sample_time = 1.", ["not valid TOML", " has 1., and a number needs digits"]),
     "noise list": ("w = {radius = [0.001, 0.001]}", "w = [1, 2]", ["noise.w: must be a box", "{ radius = [1, 2] }"]),
     "box of text": ("w = {radius = [0.001, 0.001]}", 'w = "0.1"', ["noise.w: must be a box", "radius = [...]"]),
     "signal key": ('name = "force", unit', 'name = "force", units', ["signals.input[0].units", "did you mean unit?"]),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import types
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,11 +13,13 @@ import pytest
 from cart_study import CONFIG, lines_of_table, problem_of, run, write
 
 import gsisio_jax as gx
-from gsisio_jax import examples
+from gsisio_jax import Interval, examples
 from gsisio_jax.cli import main
 from gsisio_jax.cli.config import read_config
 from gsisio_jax.cli.errors import UserError
-from gsisio_jax.cli.problem import importable
+from gsisio_jax.cli.labelled import date_attributes
+from gsisio_jax.cli.logs.config import TablePart
+from gsisio_jax.cli.problem import importable, used_box
 from gsisio_jax.cli.study_arguments import UniformInput, initial_of, noise_of, read_records, simulated
 from gsisio_jax.examples import paper
 
@@ -206,3 +210,29 @@ def test_help_shows_the_tables(command, capsys):
     for part in ("--fresh", "Ctrl-C", f"[{command.replace('-', '_')}]", f"gsisio {command} paper"):
         assert part in text
     assert max(map(len, text.splitlines())) <= 110
+
+
+def test_a_record_knows_the_zone_of_its_dates(tmp_path):
+    (tmp_path / "log.csv").write_text("t,y\n2026-03-28 20:00:00,1\n2026-03-28 20:01:00,2\n")
+    table = {"file": "log.csv", "sample_time": 60.0, "y": ["y"]}
+    for time, zone in (({"column": "t"}, ""), ({"column": "t", "zone": "Europe/Berlin"}, "Europe/Berlin")):
+        assert read_records(TablePart.model_validate(table | {"time": time}), None, tmp_path, "log.toml").zone == zone
+    assert date_attributes("Europe/Berlin")["zone"] == "Europe/Berlin"
+    assert "zone" not in date_attributes("")
+
+
+def test_boxes_that_a_module_holds(cart, tmp_path, monkeypatch):
+    module = types.ModuleType("plant_of_boxes")
+    module.model = types.SimpleNamespace(
+        error=Interval([-1e-3, -2e-3], [1e-3, 0.0]), region=Interval.symmetric([3.0, 2.0])
+    )
+    monkeypatch.setitem(sys.modules, "plant_of_boxes", module)
+    error, states = '{use = "plant_of_boxes:model.error"}', 'use = "plant_of_boxes:model.region"'
+    _, problem = problem_of(tmp_path, "w = {radius = [0.001, 0.001]}", f"w = {error}")
+    assert problem.noise.w is module.model.error
+    with pytest.raises(UserError, match=r"noise.v.use: plant_of_boxes:model.error has the shape \(2,\), and"):
+        used_box("plant_of_boxes:model.error", "cart.toml: noise.v.use", 1, "outputs")
+    config, problem = problem_of(tmp_path, "steps = 12", f"steps = 12\nx0 = {{{states}}}")
+    assert config.monte_carlo is not None
+    first = simulated(config, config.monte_carlo, problem, "cart.toml")["x0"]
+    np.testing.assert_array_equal([first.lower, first.upper], [[-3, -2], [3, 2]])

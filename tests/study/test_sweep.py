@@ -9,12 +9,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas
 import pytest
 import systems
+import xarray
 
 import gsisio_jax as gx
+from gsisio_jax.plot.dates import zone_of
 from gsisio_jax.study import Context, Kept, Reduction, Variable, quantiles, settle
 from gsisio_jax.study.kernel import fingerprint, tile_size
+from gsisio_jax.study.labels import Labels
 from gsisio_jax.study.reductions import _quantiles, resolve
 from gsisio_jax.study.row_source import Recorded
 
@@ -470,3 +474,18 @@ def test_tiles_fill_the_memory_they_may_and_the_last_one_is_nearly_full():
         tiles = -(-cases // size)
         assert size <= 65536
         assert tiles * size - cases < tiles
+
+
+def test_a_clock_of_dates_is_seconds_since_1970_that_pictures_show_as_dates(plain):
+    dates = pandas.date_range("2026-03-28 20:00", periods=T, freq="5min", tz="Europe/Berlin")
+    system = plain["observer"].system
+
+    def clock(time):
+        labels = Labels.of("sweep", system, None, None, None, None, time, T)
+        return xarray.DataArray(labels.time, dims="time", attrs=labels.clock).to_dataset(name="time")
+
+    for time, zone in ((dates, "Europe/Berlin"), (dates.tz_localize(None), ""), (0.1 * np.arange(T), None)):
+        assert zone_of(clock(time)) == zone
+    assert clock(dates)["time"][0] == 1774724400.0
+    with pytest.raises(ValueError, match="sweep: `time` has no date in row 1"):
+        clock(np.array(["2026-03-28", "NaT"], "datetime64[s]").repeat([1, T - 1]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +32,14 @@ class Table:
         u: (T, m) of known inputs, or None where the system has none. With ``dt = "as_input"`` the last column is the
             time step: row k holds the seconds from row k to row k + 1.
         notes: what was found in the file and is not plain, as (label, text).
+        zone: as of `StampReader`.
     """
 
     time: np.ndarray
     y: np.ndarray
     u: np.ndarray | None
     notes: tuple[tuple[str, str], ...] = ()
+    zone: str | None = None
 
 
 def read_table(path: Path, part: TablePart, transform: Callable[[Any], Any] | None = None) -> Table:
@@ -64,7 +66,8 @@ def read_table(path: Path, part: TablePart, transform: Callable[[Any], Any] | No
     last = max(int(rows.index[-1]) for rows in found if len(rows.index))
     if last > MAXIMUM_STEPS:
         raise UserError(f"{path.name}: the times span {last:,} steps, more than {MAXIMUM_STEPS:,}; check sample_time")
-    return filled(found, reader.notes(dialect))
+    table = filled(found, reader.notes(dialect))
+    return table if reader.stamps is None else replace(table, zone=reader.stamps.zone)
 
 
 def open_blocks(
