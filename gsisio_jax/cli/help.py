@@ -37,7 +37,7 @@ in their own --help):
   [noise]                            # bounds of the process noise w and of the measurement noise v
   w = {radius = [0.01]}              # every box is {radius = [...]} or {lower = [...], upper = [...]},
   v = {radius = [0.1]}               # one number for each component, inf where nothing is known; or
-                                     # {use = "module:attribute"}, a gx.Interval: model.error of gx.discretize, say
+                                     # {use = "module:attribute"}, a gx.Interval: the error of gx.discretize
   [region]                           # of states, for which gains are chosen and widths promised:
   lower = [-1.0]                     # lower and upper, or
   upper = [1.0]                      # auto = true and around = a state [...], a box, or "initial"
@@ -130,7 +130,8 @@ The table [monte_carlo] of CONFIG says what is simulated; no [table] is needed:
   x0 = {lower = [0, 0], upper = [1, 1]}  # of the true states; left out: the initial box
   d = {amplitude = [2.0]}            # unknown input, uniform in +-amplitude, or "module:attribute",
                                      # a function d(key, k, x) in jax.numpy; left out: zero
-  u = [0.1]                          # known inputs, constant, or "module:attribute"
+  u = [0.1]                          # known inputs, constant, or "module:attribute": an array (steps, m), or
+                                     # a function of the number of steps that returns one
   reduce, batch, picture and [monte_carlo.axes...] as in gsisio sweep --help
 
 A box that misses the truth ends the command with exit code 1 and the seed, run and step of it.

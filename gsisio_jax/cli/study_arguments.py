@@ -213,7 +213,12 @@ def _unknown_input(part: MonteCarloPart, system: Any, file: str) -> Any:
 def _known_input(part: MonteCarloPart, system: Any, file: str) -> Any:
     if part.u is None:
         if system.m:
-            raise UserError(f"{file}: monte_carlo.u is missing; the system has {system.m} known inputs")
+            count = f"{system.m} known input{'' if system.m == 1 else 's'}"
+            raise UserError(
+                f"{file}: monte_carlo.u is missing, the system has {count}: give the values that stay, u = "
+                f'{[0.0] * system.m}, or "module:attribute", an array (steps, {system.m}) or a function of the number '
+                "of steps that returns one"
+            )
         return None
     if not isinstance(part.u, str):
         if len(part.u) != system.m:
@@ -227,7 +232,10 @@ def _known_input(part: MonteCarloPart, system: Any, file: str) -> Any:
     try:
         return np.asarray(found(part.steps))
     except Exception as error:
-        raise UserError(f"{file}: monte_carlo.u: {part.u} raised {type(error).__name__}: {reason(error)}") from error
+        raise UserError(
+            f"{file}: monte_carlo.u: {part.u}, called with the number of steps, raised {type(error).__name__}: "
+            f"{reason(error)}; it must return an array (steps, {system.m})"
+        ) from error
 
 
 def _function(reference: str, key: str) -> Callable[..., Any]:

@@ -80,7 +80,18 @@ MISTAKES = {
         ["x0 leaves the", "in velocity"],
     ),
     "x0 missing": ("monte-carlo", "upper = [10.0, 12.0]", "upper = [10.0, inf]", ["give monte_carlo.x0"]),
-    "known input": ("monte-carlo", "_model:cart", "_model:pushed", ["monte_carlo.u is missing", "1 known input"]),
+    "known input": (
+        "monte-carlo",
+        "_model:cart",
+        "_model:pushed",
+        ["monte_carlo.u is missing", "1 known input: give", "u = [0.0]"],
+    ),
+    "function of a known input": (
+        "monte-carlo",
+        "steps = 12",
+        'steps = 12\nu = "study_cart_model:push"',
+        ["push, called with the number of steps, raised TypeError", "it must return an array (steps, 0)"],
+    ),
     "no known input": ("monte-carlo", "steps = 12", "steps = 12\nu = [1]", ["monte_carlo.u has 1 values", "no known"]),
 }
 
