@@ -58,6 +58,11 @@ class DelayedObserver(Wrapped):
         )
 
     @property
+    def window(self) -> Any:
+        """Rows over several steps of the lifted plant, as of an `Observer`; None where there are none."""
+        return self.inner.window
+
+    @property
     def lift(self) -> LiftedOutput:
         """How the outputs of the lifted plant come from y[k..k+L]."""
         lift = output_of(self.inner.system)

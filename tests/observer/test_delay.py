@@ -262,6 +262,7 @@ def test_where_state_bounds_alone_make_an_observer_the_certificate_names_the_del
     dials = {"missing": False, "window": 1, "sweeps": 1}
     now, late = (gx.design_observer(system, noise, system.state_bounds, delay=delay, **dials) for delay in (0, 1))
     (note,) = now.certificate.notes
+    assert now.window is late.window is None
     width = late.certificate.steady_width[0]
     assert now.certificate.steady_width[0] == 1e6
     assert width < 200
