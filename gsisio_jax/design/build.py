@@ -164,7 +164,8 @@ def design_observer(
             jump, or give no number in part of the region, there is never one, and this makes no difference.
         window: N: the current form also bounds x[k] from y[k-N..k] and the boxes of N steps before jointly, with rows
             chosen offline from simulated runs. 1 looks back one step; 3 to 5 come close to the exact hull where one
-            step does not (rotations, chains, networks), at some more operations a step. "auto" takes 3, or 5, where
+            step does not (rotations, chains, networks), at some more operations a step. Rows look back no farther than
+            that narrows runs; where that is less than N, the certificate notes it. "auto" takes 3, or 5, where
             some state gets 5 % narrower by it, else 1: in simulated runs with the slopes of the region, or with fixed
             ones; and as many rows as are worth the time that they add to a step. It stays at 1 for more than 20 states,
             for periodic ones, and where slopes have no bounds.
@@ -222,6 +223,8 @@ def design_observer(
     late = check_delay(delay, system, form)
     default = DEFAULT if form == "current" else DEFAULT_BOUNDS
     methods = check_methods("design_observer", default if bounds is None else bounds)
+    # Whole numbers of NumPy are Python's from here on: the design tells "auto" from a number by its type.
+    window = window if isinstance(window, str) else int(window)
     dials = Dials(gains, missing, sweeps, methods, certify, window, cells, split, tolerate)
     with rare_collection(), told("design_observer", progress) as say:
         if form == "prediction":

@@ -40,7 +40,7 @@ from gsisio_jax.design.region import Near, find_region, grown_around
 from gsisio_jax.design.slices import what_split_gives, with_slices
 from gsisio_jax.design.tolerant import Guessed, tolerant
 from gsisio_jax.design.undefined import undefined_in
-from gsisio_jax.design.window import what_windows_may_give
+from gsisio_jax.design.window import what_is_cut, what_windows_may_give
 from gsisio_jax.design.window_with_less import window_rows_with_less
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
@@ -171,6 +171,7 @@ def design_current(
         if rows is not None and everywhere.affine:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
+        observer = replace(observer, certificate=observer.certificate.with_notes(what_is_cut(window, rows)))
     observer = replace(observer, input_rows=rows_of_inputs(problem, system, dials.window, width, bank, observer.window))
     if maps is not None:
         rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)

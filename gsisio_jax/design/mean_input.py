@@ -16,7 +16,7 @@ from gsisio_jax.design.gain_selection import profile_of
 from gsisio_jax.design.input_rows import rows_of_sums
 from gsisio_jax.interval import rounding
 from gsisio_jax.interval.box import Interval, is_concrete
-from gsisio_jax.interval.reading import check_type
+from gsisio_jax.interval.reading import check_type, is_whole
 from gsisio_jax.observer.checks import prepare
 from gsisio_jax.observer.enclosures import slopes_of
 from gsisio_jax.observer.estimation import Estimate
@@ -71,7 +71,7 @@ def mean_input(
     if system.periodic or not system.p:
         why = "has periodic outputs" if system.p else "has no unknown input"
         raise ValueError(f"mean_input: the system {why}; the boxes of gx.estimate are all there is")
-    if isinstance(steps, bool) or not isinstance(steps, int) or not 1 <= steps < T:
+    if not is_whole(steps) or not 1 <= steps < T:
         raise ValueError(f"mean_input: `steps` must be a whole number from 1 to {T - 1} (T - 1), got {steps!r}")
     if estimate.state.shape != (T, system.n) or estimate.input.shape != (T - 1, system.p):
         raise ValueError(

@@ -60,6 +60,22 @@ def window_rows(
     return None
 
 
+def what_is_cut(asked: int | str, window: Window | None) -> str:
+    """A note where rows look back fewer steps than `window=` asked for; empty where they do, or it asked for none."""
+    length = 1 if window is None else window.length
+    if not isinstance(asked, int) or length >= asked:
+        return ""
+    if window is None:
+        return (
+            f"`window={asked}` changes nothing here: no row over several steps narrows a box in simulated runs "
+            "(or none cancels the unknown inputs), so a step looks back one step"
+        )
+    return (
+        f"`window={asked}`: the rows that were chosen look back {length} steps; none that looks back farther narrows "
+        "simulated runs beside these"
+    )
+
+
 def what_windows_may_give(observer: Observer) -> str:
     """A note of what "auto", which took none, leaves to be tried; empty where that is nothing."""
     if observer.system.n > _MOST_STATES:
