@@ -165,10 +165,11 @@ def design_observer(
         window: N: the current form also bounds x[k] from y[k-N..k] and the boxes of N steps before jointly, with rows
             chosen offline from simulated runs. 1 looks back one step; 3 to 5 come close to the exact hull where one
             step does not (rotations, chains, networks), at some more operations a step. Rows look back no farther than
-            that narrows runs; where that is less than N, the certificate notes it. "auto" takes 3, or 5, where
-            some state gets 5 % narrower by it, else 1: in simulated runs with the slopes of the region, or with fixed
-            ones; and as many rows as are worth the time that they add to a step. It stays at 1 for more than 20 states,
-            for periodic ones, and where slopes have no bounds.
+            that narrows runs; where that is less than N, the certificate notes it. "auto" takes 3, or 5, where some
+            state gets 5 % narrower by it, else 1: in simulated runs with the slopes of the region, or with fixed ones;
+            10 or 20 steps with a few rows, where 5 are worth it and each of these lengths makes some state a quarter
+            narrower than the one before; and as many rows as are worth the time that they add to a step. It stays at 1
+            for more than 20 states, for periodic ones, and where slopes have no bounds.
         delay: L: bound x[k] from y[0..k+L], for plants whose unknown input shows only L steps later (a force, where
             positions are measured), or to smooth. Outputs, but for those of step k, must be affine in the state, and
             so must be for L >= 2 the parts of f that they see. "auto" takes the smallest L up to n that shows every

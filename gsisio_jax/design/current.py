@@ -41,6 +41,7 @@ from gsisio_jax.design.slices import what_split_gives, with_slices
 from gsisio_jax.design.tolerant import Guessed, tolerant
 from gsisio_jax.design.undefined import undefined_in
 from gsisio_jax.design.window import what_is_cut, what_windows_may_give
+from gsisio_jax.design.window_length import units_of_windows
 from gsisio_jax.design.window_with_less import window_rows_with_less
 from gsisio_jax.errors import NoDesignFound, ObserverDoesNotExist
 from gsisio_jax.interval.box import Interval
@@ -162,6 +163,8 @@ def design_current(
         found = found.with_notes(grown_around(near, box) if given is None else "")
         observer = replace(observer, certificate=found)
     window = 1 if dials.tolerate else dials.window
+    if everywhere.affine and not np.isfinite(problem.steady_width(main)).all():
+        width = units_of_windows(problem, width, system.n + 1)
     if window == "auto" and not (first.slopes.finite and not system.periodic_states):
         window = 1
     if window != 1:
@@ -176,8 +179,9 @@ def design_current(
     if maps is not None:
         rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
         observer = replace(observer, recovery=rows_alone)
-    if window == "auto" and observer.window is None:
-        observer = replace(observer, certificate=observer.certificate.with_notes(what_windows_may_give(observer)))
+    if window == "auto":
+        way = what_windows_may_give(observer, problem, width)
+        observer = replace(observer, certificate=observer.certificate.with_notes(way))
     if dials.certify and not dials.tolerate:
         way = what_a_delay_gives(plan, observer.certificate, box)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))

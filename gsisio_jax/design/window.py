@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
+from gsisio_jax.design.window_length import length_worth_trying, widths_from_above
 from gsisio_jax.design.window_runs import Rows
 from gsisio_jax.design.window_search import WORTH, Search
 from gsisio_jax.interval.box import Interval
@@ -19,6 +20,8 @@ from gsisio_jax.observer.window import Window
 
 _ROUNDS = 4  # of runs, each with all rows so far
 _TRIED = (3, 5)  # windows that "auto" looks at
+_LONGER = (5, 10, 20)  # and where 5 is worth it, as long as each leads to much narrower boxes than the one before
+_THINNER_LONG = (4, 2, 1)  # of long windows, whose rows cost more
 _THINNER = (16, 8, 4, 2)  # rows a state that are tried, the first ones of a bank, where all cost more than they bring
 _MOST_STATES = 20  # beyond, the programs of "auto" would take too long
 
@@ -54,7 +57,7 @@ def window_rows(
     # On narrow boxes slopes vary less than on the region: the truth lies between the two.
     for sizes in [scaled, scaled.with_fixed_slopes()] if scaled.nonlinear else [scaled]:
         found = _worth_it(sizes, [problem.scaled_gain(N, width) for N in gains], start, seed)
-        window = None if found is None else as_window(problem, max(_TRIED), *found, width)
+        window = None if found is None else as_window(problem, *found, width)
         if window is not None and window.length > 1:  # rows of one step only are what `gains` is for
             return window
     return None
@@ -76,8 +79,20 @@ def what_is_cut(asked: int | str, window: Window | None) -> str:
     )
 
 
-def what_windows_may_give(observer: Observer) -> str:
-    """A note of what "auto", which took none, leaves to be tried; empty where that is nothing."""
+def what_windows_may_give(observer: Observer, problem: GainProblem, width: np.ndarray) -> str:
+    """A note of what "auto" leaves to be tried; empty where that is nothing."""
+    longest = max(_LONGER)
+    if observer.window is not None:
+        if observer.window.length <= longest // 2:
+            return ""
+        scaled = problem.scaled(width)
+        if length_worth_trying(scaled, (longest, 2 * longest)) == longest:
+            return ""
+        share = (widths_from_above(scaled, 2 * longest) / widths_from_above(scaled, longest)).min()
+        return (
+            f'window="auto" ends at {longest} steps; the best rows over {2 * longest} make boxes of some state '
+            f"{1 / share:.2g} times narrower in the end: `window={2 * longest}`, where a step may take as much longer"
+        )
     if observer.system.n > _MOST_STATES:
         return f'window="auto" tries none for more than {_MOST_STATES} states: `window=3` may give narrower boxes'
     endless = set(np.flatnonzero(~np.isfinite(observer.certificate.steady_width)))
@@ -88,13 +103,13 @@ def what_windows_may_give(observer: Observer) -> str:
 
 def _worth_it(
     problem: GainProblem, gains: list[np.ndarray], start: np.ndarray, seed: int
-) -> tuple[Rows, list[int]] | None:
-    """Rows over the shortest window that is worth it, and which of them to keep."""
+) -> tuple[int, Rows, list[int]] | None:
+    """The shortest window that is worth it, rows over it, and which of them to keep."""
     search = Search(problem, max(_TRIED), gains, start, seed)
     steps = _TRIED[0]
     if not (search.settles_narrower(max(_TRIED)) or search.could_bring(max(_TRIED), [])):
         kept = search.early(steps, [])
-        return (search.rows, kept) if search.begins_narrower(kept) else None
+        return (search.length, search.rows, kept) if search.begins_narrower(kept) else None
     kept = search.collected(steps, 1)
     for longer in _TRIED[1:]:
         if search.could_bring(longer, kept, steps):
@@ -104,8 +119,32 @@ def _worth_it(
         for most in _THINNER:
             fewer = search.first_of_each(kept, most)
             if search.brings(fewer) > WORTH * worth_of_time(search.cost(fewer)):
-                return search.rows, fewer
-    return (search.rows, kept) if search.begins_narrower(kept) else None
+                found = search.length, search.rows, fewer
+                return (_longer(search, fewer) if steps == max(_TRIED) else None) or found
+    return (search.length, search.rows, kept) if search.begins_narrower(kept) else None
+
+
+def _longer(short: Search, kept: list[int]) -> tuple[int, Rows, list[int]] | None:
+    """A longer window than that of a search which keeps these rows, with a few rows that are worth more, or None.
+
+    They are worth it for what a step takes with them beside one without a window, and narrower by `WORTH` than the
+    short ones, and by as much more as they take longer than these.
+    """
+    problem = short.problem
+    steps = length_worth_trying(problem, _LONGER)
+    if steps == short.length:
+        return None
+    search = Search(problem, steps, short.bank, short.start, short.seed)
+    rows, by_short, so_far = search.collected(steps, 1), short.typical(kept), short.cost(kept)
+    for most in _THINNER_LONG:
+        fewer = search.first_of_each(rows, most)
+        cost, widths = search.cost(fewer), search.typical(fewer)
+        # Shares end at 1: half as wide, and half of that again, count the same.
+        brings, more = (-np.log1p(-share) for share in (search.brings(fewer), search.narrower(fewer, by_short)))
+        worth_it = brings > WORTH * worth_of_time(cost) and more > WORTH * max(1, worth_of_time(cost / so_far))
+        if worth_it and not (widths > (1 + WORTH) * by_short).any():
+            return steps, search.rows, fewer
+    return None
 
 
 def worth_of_time(cost: float) -> float:

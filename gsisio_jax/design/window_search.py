@@ -15,6 +15,7 @@ WORTH = 0.05  # share of the width of some state that a window must bring to be 
 _SAMPLES = 6  # steps of a round of runs for which exact rows are asked
 _ROUNDS_EARLY = 2  # of runs from the region's width
 _MOST_ROWS = 16  # of a state
+_EVERY = 5  # lengths up to this are all looked at for rows of typical widths
 _LEAST_GAIN = 2e-3  # share of the width that one more row must bring
 _EARLY = 10  # steps from the region's width, in which boxes have not settled yet
 _WORTH_EARLY = 0.2  # share of the width there that a window must bring, which costs its operations in all later steps
@@ -39,7 +40,7 @@ class Search:
         self.rng = np.random.default_rng(seed)
         self.rows = rows_of_gains(problem, gains, length)
         self.own = len(self.rows.parts)
-        self.gains = len(gains)
+        self.bank, self.gains = gains, len(gains)
         self.half = np.full(problem.n, 0.5)
 
     def runs(self, seed: int) -> Runs:
@@ -150,16 +151,21 @@ class Search:
 
     def brings(self, kept: list[int]) -> float:
         """The largest share of a state's width that these rows take away in runs, or where boxes settle."""
+        return self.narrower(kept, self._by_gains)
+
+    def narrower(self, kept: list[int], typical: np.ndarray) -> float:
+        """The same beside widths that were `typical` of other rows."""
         with np.errstate(all="ignore"):
-            shares = 1 - self._typical(kept) / self._by_gains
+            shares = 1 - self.typical(kept) / typical
         return float(np.nan_to_num(shares, nan=0.0).max(initial=0.0))
 
     @cached_property
     def _by_gains(self) -> np.ndarray:
         """With the gains alone: the same for all banks that are compared once rows have been `collected`."""
-        return self._typical([])
+        return self.typical([])
 
-    def _typical(self, kept: list[int]) -> np.ndarray:
+    def typical(self, kept: list[int]) -> np.ndarray:
+        """Widths (2, n) with these rows: in simulated runs, and where boxes settle."""
         return np.array([self.widths(kept), self.settled(self.with_gains(kept))])
 
     def cost(self, kept: list[int]) -> float:
@@ -217,7 +223,8 @@ class Search:
 def _add_profile_rows(problem: GainProblem, steps: int, length: int, rows: Rows) -> np.ndarray:
     """Adds the best rows over every window for boxes of the widths that they themselves lead to, and says these."""
     half = np.full(problem.n, 0.5)
-    for count in range(1, steps + 1):
+    # Of long windows some lengths: the programs are as many as there are lengths, and larger.
+    for count in [c for c in range(1, steps + 1) if c <= _EVERY or c in (steps // 2, steps)]:
         program = WindowProgram.of(problem, count, length)
         best = []
         for _ in range(30 if count == 1 else 3):

@@ -52,8 +52,9 @@ def test_larger_plants_get_a_window_or_are_told_of_it():
     assert told.certificate.notes[-1].endswith("`window=3` may give narrower boxes")
 
 
-def test_a_window_is_named_where_no_width_is_promised():
-    """Position of three integrators: one step promises nothing, the outputs of several determine all."""
+def test_a_window_is_found_where_no_step_promises_a_width():
+    """Position of three integrators: one step promises nothing, the outputs of several determine all. Boxes were 10
+    times as wide with "auto", which saw no use of a window in units that one step gives such states."""
     A = np.array([[1, 0.1, 0], [0, 1, 0.1], [0, 0, 1]])
     system = gx.System(lambda x: A @ x, lambda x: x[:1], G=np.zeros((3, 0)), H=np.zeros((1, 0)))
     noise = gx.Noise(Interval.symmetric([1e-4] * 3), Interval.symmetric([0.01]))
@@ -62,9 +63,7 @@ def test_a_window_is_named_where_no_width_is_promised():
     for window in ("auto", 20):
         observer = gx.design_observer(system, noise, Interval.entire(3), window=window)
         widths.append(gx.estimate(observer, Interval.symmetric([1.0, 2, 1]), y).state.width[-1])
-        named = any("try `window=5` or `window=20`" in note for note in observer.certificate.notes)
-        assert named == (window == "auto")
-    assert (widths[1][1:] < 0.1 * widths[0][1:]).all()
+    assert (widths[0][1:] < 1.3 * widths[1][1:]).all()
 
 
 def _costs(monkeypatch, cost):

@@ -1,7 +1,8 @@
-"""Windows of many steps: said where they cannot be had. Nothing is compiled."""
+"""Windows of many steps: taken where they pay, said where they cannot be had. Nothing is compiled."""
 
 import numpy as np
 import pytest
+from oracles.record_hull import exact_hull
 
 import gsisio_jax as gx
 from gsisio_jax import Interval
@@ -38,3 +39,34 @@ def test_a_window_without_rows_is_a_note():
     assert observer.window is None
     assert any(note.startswith("`window=6` changes nothing here") for note in observer.certificate.notes)
     assert not any("`window=" in note for note in designed(tracked(0.1, 0.1), window=3).certificate.notes)
+
+
+def settled(plant, observer, steps):
+    """Widths behind a record in which everything rests, and those of its exact hull."""
+    A, y = np.array([plant[0].f(e) for e in np.eye(3)]).T, np.zeros((steps, 1))
+    boxes = gx.estimate(observer, Interval.entire(3), y).state
+    w, v = (np.asarray(part.upper) for part in (plant[1].w, plant[1].v))
+    return np.asarray(boxes.width), exact_hull(A, np.eye(3)[:1], w, v, np.full(3, 1e6), y)
+
+
+def test_the_default_tracks_accelerations_nearly_as_well_as_the_whole_record():
+    """Over five steps the speed is 2.4 times, the acceleration 4.9 times as wide."""
+    plant = tracked(0.1, 0.1)
+    observer = designed(plant)
+    assert observer.window.length > 10
+    width, exact = settled(plant, observer, 45)
+    assert (width[-1] >= exact * (1 - 1e-6)).all()
+    assert (width[-1] <= 1.15 * exact).all()
+
+
+def test_states_that_show_slowly_do_not_stay_infinite():
+    """At 100 Hz the position says of an acceleration what it moves it in two steps: 1e-4 of it. Units in which that is
+    nothing hid the rows that need no box, and what windows bring."""
+    plant = tracked(0.01, 0.1)
+    observer = gx.design_observer(*plant, region=Interval.entire(3))
+    assert list(observer.certificate.rows_until_finite()) == [0, 2, 2]
+    assert observer.window.length == 20
+    assert any("the best rows over 40" in note for note in observer.certificate.notes)
+    width, exact = settled(plant, observer, 23)
+    assert np.isfinite(width[2:]).all()
+    assert (width[-1] <= 1.3 * exact).all()
