@@ -97,6 +97,7 @@ class DesignPart(Part):
     split: Count = None
     cells: Count = None
     delay: Delay = None
+    rates: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] | None = None
     bounds: Annotated[list[str], Field(min_length=1)] | None = None
     form: Literal["current", "prediction"] | None = None
     left_inverse: Literal["pseudo", "feedthrough", "smallest"] | None = None

@@ -46,6 +46,7 @@ in their own --help):
   [design]                           # options of gx.design_observer, which explains them
   gains = 1                          # also sweeps, window, delay, split, cells, missing, certify,
                                      # bounds, form = "prediction", left_inverse, allow_uncertified
+  rates = [1, 20]                    # every how many rows each output comes, where they differ
   [estimate]
   on_conflict = "restart"            # or "hold": what is believed after a contradiction
   [outputs]                          # file names: netcdf, csv, picture, report; draw = "module:function"

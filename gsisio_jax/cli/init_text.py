@@ -8,9 +8,12 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from .init_columns import Column
 from .logs.units import conversion
 
+_LONGEST = 200  # rows of a pattern that `rates` can have
 DEGREES = {"deg": "rad", "°": "rad", "deg/s": "rad/s", "°/s": "rad/s"}
 
 
@@ -92,7 +95,7 @@ auto = true
 lower = "FILL_IN"
 upper = "FILL_IN"
 
-[table]
+{_rates(used)}[table]
 file = {_quoted(file)}
 {_found(dialect)}{_clock(clock)}
 # Columns of numbers, in the order of y in plant.py. Known inputs go to u = [...]; then it is f(x, u) and
@@ -240,6 +243,19 @@ def _missing(columns: list[Column]) -> str:
         return '# missing = [-9999, "---"]         # cells that mean missing, besides empty ones, NaN and NA'
     listed = ", ".join(str(one) if isinstance(one, int) else _quoted(one) for one in found)
     return f"# These cells look as if they meant missing; take out what does not.\nmissing = [{listed}]"
+
+
+def _rates(used: list[Column]) -> str:
+    """The part [design] where some columns come in every m-th row alone, and all of them together in some row."""
+    there = [np.isfinite(column.values) & ~np.isin(column.values, column.sentinels) for column in used]
+    strides = [np.unique(np.diff(np.flatnonzero(rows))) for rows in there]
+    if not all(len(stride) == 1 for stride in strides) or not np.all(there, axis=0).any():
+        return ""
+    rates = [int(stride[0]) for stride in strides]
+    if max(rates) == 1 or np.lcm.reduce(rates) > _LONGEST:
+        return ""
+    slow = ", ".join(re.sub(r"\s+", " ", c.name) for c, rate in zip(used, rates, strict=True) if rate > 1)
+    return f"[design]\n# Every how many rows each of y comes, as not every row has {slow}.\nrates = {rates}\n\n"
 
 
 def _columns(columns: list[Column], used: list[Column]) -> str:

@@ -48,7 +48,7 @@ def summarise(
         *([("units?", doubt(totals))] if doubt(totals) else []),
         ("unbounded", f"{totals.statuses['UNBOUNDED']} steps with a state that is not bounded"),
         *([("delay", _delay(outcome.boxes.delay))] if outcome.boxes.delay else []),
-        ("outside", str(outside(totals, outcome))),
+        ("outside", _outside(totals, outcome)),
         *([("resumed", f"after step {outcome.resumed:,}")] if outcome.resumed else []),
         ("design", f"{outcome.design_seconds:.2f} s"),
         ("compile", f"{outcome.compile_seconds:.2f} s"),
@@ -94,9 +94,20 @@ def outside(totals: Totals, outcome: Outcome) -> Outside:
     return Outside(totals.steps, totals.outside, totals.beyond, outcome.u_outside, totals.unread)
 
 
+def _outside(totals: Totals, outcome: Outcome) -> str:
+    rates = outcome.observer.certificate.rates
+    if rates is not None and rates.period > 1:
+        return f"not counted: a width is promised while outputs come every {', '.join(map(str, rates.rates))} rows"
+    return str(outside(totals, outcome))
+
+
 def certificate_lines(certificate: Any, problem: Problem, found: Outside | None = None) -> list[str]:
     """The certificate in short: what is promised, or why nothing is, and where a run was outside of it."""
-    if not certificate.certified:
+    if certificate.rates is not None and np.isfinite(certificate.rate_width).all():
+        many = len(certificate.rate_width) > 1
+        when = "outputs come at the stated rates" if many else "no measurement is missing"
+        lines = [f"holds anywhere: while {when}, widths settle at or below the certified ones"]
+    elif not certificate.certified:
         lines = ["none: no bound on the widths is promised (the boxes are guaranteed all the same)"]
     elif not certificate.self_consistent:
         short = [name for name, slack in zip(problem.state.names, certificate.slack, strict=True) if slack < 0]
@@ -105,7 +116,7 @@ def certificate_lines(certificate: Any, problem: Problem, found: Outside | None 
         lines = ["holds anywhere: while no measurement is missing, widths settle at or below the certified ones"]
     else:
         lines = ["holds: as long as the boxes stay in the region, widths settle at or below the certified ones"]
-    if found is not None and found.outside and certificate.self_consistent:
+    if found is not None and found.outside and certificate.self_consistent and certificate.rates is None:
         lines = [found.of_promise(), f"where it applies: {lines[0].partition(': ')[2]}"]
     if certificate.recoverable is False:
         lines.append("after a lost row the boxes may stay unbounded")
@@ -140,10 +151,14 @@ def promised(totals: Totals, certificate: Any) -> Iterator[tuple[Signal, float |
     """Every signal with its certified width and its room in the region; None where nothing is promised."""
     # Where f and g are affine there is no region to leave.
     rooms = np.asarray(certificate.slack) if certificate.region_matters else [None] * len(certificate.steady_width)
-    states = zip(np.asarray(certificate.steady_width), rooms, strict=True)
-    inputs = ((width, None) for width in np.asarray(certificate.input_width))
+    of_states, of_inputs, by_rates = certificate.steady_width, certificate.input_width, certificate.rates is not None
+    if by_rates:  # the widest of all phases; of inputs nothing is promised for rates
+        of_states, of_inputs = certificate.rate_width.max(0), np.full(len(of_inputs), np.inf)
+    states = zip(np.asarray(of_states), rooms, strict=True)
+    inputs = ((width, None) for width in np.asarray(of_inputs))
     for signal, (width, room) in zip(totals.signals, (*states, *inputs), strict=True):
-        yield (signal, float(width), room) if certificate.certified else (signal, None, None)
+        there = np.isfinite(width) if by_rates else certificate.certified
+        yield (signal, float(width), room) if there else (signal, None, None)
 
 
 def short(value: float) -> str:

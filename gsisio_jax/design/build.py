@@ -13,6 +13,7 @@ from gsisio_jax.design.current import Dials, design_current
 from gsisio_jax.design.delay import check_delay, design_delayed
 from gsisio_jax.design.prediction import DEFAULT_BOUNDS, LeftInverse, design_prediction
 from gsisio_jax.design.progress import told
+from gsisio_jax.design.rates import check_rates
 from gsisio_jax.design.region import Around, read_around
 from gsisio_jax.design.slices import check_split
 from gsisio_jax.design.tolerant import check_tolerate
@@ -46,6 +47,7 @@ def design_observer(
     tolerate: Literal[0] = 0,
     around: Around | None = None,
     progress: bool | None = None,
+    rates: Sequence[int] | None = None,
 ) -> Observer: ...
 
 
@@ -131,6 +133,7 @@ def design_observer(
     tolerate: int = 0,
     around: Around | None = None,
     progress: bool | None = None,
+    rates: Sequence[int] | None = None,
 ) -> Observer | PredictionObserver | DelayedObserver | TolerantObserver:
     """Design the gains of an interval observer offline, and certify the width of its boxes.
 
@@ -194,6 +197,10 @@ def design_observer(
             elsewhere leaves such a region, which the certificate notes, and ``est.summary()`` counts.
         progress: say on standard error what the design is at, once it has taken two seconds. None: where that is a
             terminal or a notebook.
+        rates: current form: for every output, every how many rows it comes: (1, 20) for a second one that comes with
+            every twentieth row and is NaN in between. Rows over several steps are then chosen for that pattern ("auto":
+            over whole periods), and where f and g are affine the certificate promises widths for every phase of it.
+            Boxes are certain whatever comes. None: every output comes in every row, but for what is lost.
 
     Returns:
         An `Observer` (`PredictionObserver` for the prediction form); ``print(observer.certificate)`` says what it
@@ -226,7 +233,8 @@ def design_observer(
     methods = check_methods("design_observer", default if bounds is None else bounds)
     # Whole numbers of NumPy are Python's from here on: the design tells "auto" from a number by its type.
     window = window if isinstance(window, str) else int(window)
-    dials = Dials(gains, missing, sweeps, methods, certify, window, cells, split, tolerate)
+    rates = check_rates(rates, system.l, form, missing, delay, tolerate)
+    dials = Dials(gains, missing, sweeps, methods, certify, window, cells, split, tolerate, rates)
     with rare_collection(), told("design_observer", progress) as say:
         if form == "prediction":
             return design_prediction(

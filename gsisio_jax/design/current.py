@@ -35,6 +35,7 @@ from gsisio_jax.design.initial_contraction import check_initial_contraction
 from gsisio_jax.design.input_rows import rows_of_inputs
 from gsisio_jax.design.inputs import input_bounds
 from gsisio_jax.design.progress import Say
+from gsisio_jax.design.rates import gains_of_rates, rate_widths, rows_of_rates
 from gsisio_jax.design.recovery import with_recovery
 from gsisio_jax.design.region import Near, find_region, grown_around
 from gsisio_jax.design.slices import what_split_gives, with_slices
@@ -65,6 +66,7 @@ class Dials(NamedTuple):
     cells: int | Literal["auto"]
     split: int | Literal["auto"]
     tolerate: int
+    rates: tuple[int, ...] | None = None
 
     def quick(self) -> Dials:
         """For a design that is tried only."""
@@ -137,6 +139,8 @@ def design_current(
         bank.extend(gains_for_missing(problem, main, box, together))
     if main is not first.gain:
         bank.append(first.gain)
+    if dials.rates is not None:
+        bank.extend(gains_of_rates(problem, dials.rates, main, box))
     guessed = Guessed(problem, main, box, feedthrough, dials.tolerate) if dials.tolerate else None
     if guessed is not None:
         bank.extend(guessed.gains())
@@ -169,17 +173,25 @@ def design_current(
         window = 1
     if window != 1:
         say("choosing rows over several steps")
-        rows = window_rows_with_less(problem, window, width, bank, box, together)
+        if dials.rates is None:
+            rows = window_rows_with_less(problem, window, width, bank, box, together)
+        else:
+            rows = rows_of_rates(problem, dials.rates, window, width, bank)
         observer = replace(observer, window=rows)
-        if rows is not None and everywhere.affine:
+        if rows is not None and everywhere.affine and dials.rates is None:
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
         observer = replace(observer, certificate=observer.certificate.with_notes(what_is_cut(window, rows)))
+    if dials.rates is not None or (observer.window is not None and not observer.certificate.certified):
+        found = None
+        if everywhere.affine:
+            found = rate_widths(problem, dials.rates or (1,) * problem.l, observer.window, bank)
+        observer = replace(observer, certificate=observer.certificate.with_rates(found, noise))
     observer = replace(observer, input_rows=rows_of_inputs(problem, system, dials.window, width, bank, observer.window))
     if maps is not None:
         rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)
         observer = replace(observer, recovery=rows_alone)
-    if window == "auto":
+    if window == "auto" and dials.rates is None:
         way = what_windows_may_give(observer, problem, width)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))
     if dials.certify and not dials.tolerate:

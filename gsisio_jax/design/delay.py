@@ -215,12 +215,16 @@ def _certificate(found: Certificate, rows: LiftedRows, system: System, delay: in
         return weights[:, :l] + weights[:, l:] @ of_v, weights[:, l:] @ of_w
 
     (noise_v, more_w), (input_v, input_w) = split(found.noise_v), split(found.input_noise_v)
-    window = found.window
-    if window is not None:
-        of_rows, more_of_rows = split(window.noise_v)
-        window = replace(window, noise_v=of_rows, noise_w=np.asarray(window.noise_w) + more_of_rows)
+
+    def in_noise_of_plant(widths: Any) -> Any:
+        if widths is None:
+            return None
+        of_rows, more_of_rows = split(widths.noise_v)
+        return replace(widths, noise_v=of_rows, noise_w=np.asarray(widths.noise_w) + more_of_rows)
+
     note = f"delay {delay}: these are boxes of x[k] from y[0..k+{delay}]"
     return replace(
         found, noise_v=noise_v, noise_w=np.asarray(found.noise_w) + more_w, input_noise_v=input_v,
-        input_noise_w=input_w, window=window, notes=(*found.notes, note),
+        input_noise_w=input_w, window=in_noise_of_plant(found.window), rates=in_noise_of_plant(found.rates),
+        notes=(*found.notes, note),
     )  # fmt: skip

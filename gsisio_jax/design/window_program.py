@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -95,6 +95,15 @@ class WindowProgram:
             if np.abs(self.equal @ x + self.equal_offset[:, state]).max() > _SMALL:
                 return None
         return x
+
+
+def masked_program(problem: GainProblem, steps: int, present: np.ndarray, phase: int) -> WindowProgram:
+    """Rows over `steps` steps up to one in that phase of a pattern (P, l), without outputs that do not come."""
+    there = present[(phase - steps + np.arange(steps + 1)) % len(present)]
+    of_z = (there[-1] | (problem.T2 == 0)).all(1)
+    used = np.concatenate([there[:-1].ravel(), np.full((steps - 1) * problem.n, True), of_z])
+    whole = WindowProgram.of(problem, steps, steps)
+    return replace(whole, parts=whole.parts[:, used], equal=whole.equal[:, used])
 
 
 def rows_of_gains(problem: GainProblem, gains: list[np.ndarray], length: int) -> Rows:

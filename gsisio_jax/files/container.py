@@ -19,7 +19,7 @@ from gsisio_jax._version import __version__
 from gsisio_jax._whole import put
 from gsisio_jax.files.tree import Node, Unknown, decode, encode
 
-VERSION = 5
+VERSION = 6
 """Of the layout; to be raised with every change of what a field of an observer or a carry means."""
 _HEADER = "header.json"
 

@@ -31,10 +31,20 @@ def _classes() -> dict[str, type]:
     from gsisio_jax.inclusion.atoms import AtomBounds
     from gsisio_jax.inclusion.planes import Abstraction
     from gsisio_jax.interval.box import Interval
-    from gsisio_jax.observer import bank, input_memory, past, recovery, slices, types, window, window_widths
+    from gsisio_jax.observer import (
+        bank,
+        input_memory,
+        past,
+        recovery,
+        slices,
+        types,
+        window,
+        window_widths,
+    )
     from gsisio_jax.observer.certificate import Certificate
     from gsisio_jax.observer.delayed import DelayedObserver, Waiting
     from gsisio_jax.observer.prediction_step import PredictionObserver
+    from gsisio_jax.observer.rate_widths import RateWidths
     from gsisio_jax.observer.tolerant import Guesses, TolerantObserver
     from gsisio_jax.plant.system import Noise, System
 
@@ -43,7 +53,7 @@ def _classes() -> dict[str, type]:
         Guesses, TolerantObserver, Waiting,
         bank.CancellationResidual, bank.LinearBounds, types.Carry, types.ExactInputs, types.InitialContraction,
         types.Observer, types.RoundingConstants, past.Past, recovery.Recovery, slices.Slices, window.Window,
-        window_widths.WindowWidths,
+        window_widths.WindowWidths, RateWidths,
         input_memory.InputMemory, input_memory.InputRows,
     )  # fmt: skip
     return {kind.__name__: kind for kind in found}

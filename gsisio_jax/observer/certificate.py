@@ -44,6 +44,12 @@ class Certificate(eqx.Module):
             affine the trial is the rule.
         lost_row_width: (m, n), how wide boxes are in these rows: `recovered_width`.
         window: what rows over several steps make of widths (`WindowWidths`), where f and g are affine; else None.
+        rates: what gains and rows over several steps make of widths in the phases of a pattern (`RateWidths`): of the
+            `rates` of the design, or of P = 1 phase, where rows over several steps promise widths and the first gain
+            does not; else None.
+        rate_width: (P, n) width that the state boxes settle at or below in every phase, from any finite box, at the
+            noise of the design, while outputs come as `rates` say; ``inf`` where none is promised. For other noise
+            ``rates.settled(noise)``. None where `rates` is.
         rounds: how often the certified bound is applied in a step, about the middle of what it has left (theory 5.6).
         excess: (n,), width that they leave of boxes as wide as the region.
         slices: the slopes on parts of the region (`Slices`), where the design was asked to `split` it; else None. Then
@@ -81,6 +87,8 @@ class Certificate(eqx.Module):
     input_noise_w: Any = None  # (p, n), weight of w in input boxes beside that of `input_state_now`; None: nothing
     excess: Any = 0.0
     rounds: int = eqx.field(static=True, default=0)
+    rates: Any = None
+    rate_width: Any = None
 
     @property
     def rate(self) -> float:
@@ -166,6 +174,12 @@ class Certificate(eqx.Module):
             return self
         found = replace(self, window=window)
         return replace(found, steady_width=found.widths(noise), input_width=found.input_widths(noise))
+
+    def with_rates(self, rates: Any, noise: Noise) -> Certificate:
+        """The promise for a pattern of outputs (`RateWidths`), at the noise of the design; None: none can be made."""
+        if rates is None:
+            return self.with_notes("no width is promised for `rates`, as f and g are not affine: boxes are certain")
+        return replace(self, rates=rates, rate_width=rates.settled(noise))
 
     def with_slices(self, slices: Any, noise: Noise) -> Certificate:
         """The promise that counts slopes slice by slice (`Slices`), at the noise of the design; as it was, where no
@@ -253,6 +267,8 @@ class Certificate(eqx.Module):
             lines.append(f"  a lost row of measurements is {'' if self.recoverable else 'NOT '}recovered from")
         if self.recovery_steps and self.lost_row_steps:
             lines.extend(self._recovery())
+        if self.rates is not None:
+            lines.extend(self._by_rates())
         lines.extend(f"  note: {note}" for note in self.notes)
         return "\n".join(lines)
 
@@ -273,9 +289,28 @@ class Certificate(eqx.Module):
             lines.append(f"  state {i + 1:<4}" + "".join(f"{text:>14}" for text in cells))
         return lines
 
+    def _by_rates(self) -> list[str]:
+        """What is promised for the rates of the outputs."""
+        width = np.asarray(self.rate_width)
+        if len(width) == 1:
+            columns = {"widest": width[0]}
+            lines = [
+                "  rows over several steps: while no entry is missing widths settle, from any finite box, at or below"
+            ]
+        else:
+            columns = {"all come": width[0], "before that": width[-1], "widest": width.max(0)}
+            every = ", ".join(str(rate) for rate in self.rates.rates)
+            lines = [f"  outputs every {every} rows: widths settle from any finite box, in the row where they"]
+        lines.append("  " + " " * 10 + "".join(f"{name:>14}" for name in columns))
+        for i in range(width.shape[1]):
+            lines.append(f"  state {i + 1:<4}" + "".join(f"{column[i]:>14.6g}" for column in columns.values()))
+        return lines
+
     def _headline(self) -> str:
         if not self.framer:
             return "Certificate: NONE. This recursion is NO framer: its boxes may cross and miss the truth."
+        if not self.certified and self.rates is not None and np.isfinite(self.rate_width).all():
+            return "Certificate: widths settle by rows over several steps (below); the gain of one step promises none."
         if not self.certified:
             return "Certificate: NONE. The boxes are certain, but no bound on their width is promised."
         if not self.self_consistent:

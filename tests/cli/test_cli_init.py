@@ -216,6 +216,18 @@ def test_degrees_become_radians(folder):
     np.testing.assert_allclose(found["noise"]["v"]["radius"], [np.deg2rad(0.25), np.deg2rad(0.5), 0.5], rtol=1e-3)
 
 
+@pytest.mark.parametrize(("every", "rates"), [(5, [1, 5]), (1, None), (150, None)])
+def test_a_column_that_comes_every_so_many_rows_has_a_rate(folder, every, rates):
+    """In 150 rows one that is there once has none, nor has one of which another cell is empty."""
+    rows = [f"{k},{np.sin(k):.3f},{np.cos(k):.3f}" if k % every == 0 else f"{k},{np.sin(k):.3f}," for k in range(150)]
+    (folder / "log.csv").write_text("\n".join(["t,fast,slow", *rows]) + "\n")
+    assert main(["init", "log.csv"]) == 0
+    assert tomllib.loads((folder / "log.toml").read_text()).get("design") == (rates and {"rates": rates})
+    (folder / "gap.csv").write_text("\n".join(["t,fast,slow", *rows[:25], "25,.1,", *rows[26:]]) + "\n")
+    assert main(["init", "gap.csv", "--out", "gap"]) == 0
+    assert "design" not in tomllib.loads((folder / "gap" / "gap.toml").read_text())
+
+
 def test_the_mark_in_a_list(folder):
     (folder / "a.toml").write_text('[noise]\nw = {radius = [1, "FILL_IN"]}\n')
     with pytest.raises(UserError, match=re.escape("a.toml: fill in what says FILL_IN: noise.w.radius[1]")):
