@@ -182,10 +182,10 @@ def design_current(
             widths = WindowWidths.of(rows, problem.F, problem.E, problem.T2, problem.dd)
             observer = replace(observer, certificate=observer.certificate.with_window(widths, noise))
         observer = replace(observer, certificate=observer.certificate.with_notes(what_is_cut(window, rows)))
-    if dials.rates is not None or (observer.window is not None and not observer.certificate.certified):
-        found = None
-        if everywhere.affine:
-            found = rate_widths(problem, dials.rates or (1,) * problem.l, observer.window, bank)
+    by_window = everywhere.affine and observer.window is not None and not observer.certificate.certified
+    if dials.rates is not None or by_window:
+        rates = dials.rates or (1,) * problem.l
+        found = rate_widths(problem, rates, observer.window, bank) if everywhere.affine else None
         observer = replace(observer, certificate=observer.certificate.with_rates(found, noise))
     observer = replace(observer, input_rows=rows_of_inputs(problem, system, dials.window, width, bank, observer.window))
     if maps is not None:

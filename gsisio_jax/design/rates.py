@@ -200,7 +200,8 @@ def rate_widths(
         if np.count_nonzero(problem.C[j]) == 1:
             i = int(np.flatnonzero(problem.C[j])[0])
             add([], np.zeros(n), problem.T2[j] / problem.C[j, i], 0.0, [support[j]], i)
-    for r, i in enumerate(() if window is None else window.targets):
+    for r, i in enumerate(window.targets if window is not None else ()):
+        assert window is not None
         of_f, of_g = window.multipliers[:, r, :n], window.multipliers[:, r, n:]
         lags = [of_f[t] @ problem.F + of_g[t] @ problem.E - window.states(t, n)[r] for t in range(N)]
         v = np.abs(of_g).sum(0) + np.abs(window.remainder[r] @ problem.T2)

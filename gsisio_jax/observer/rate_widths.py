@@ -69,7 +69,7 @@ class RateWidths(eqx.Module):
                 break
             far = np.where(settles, far, np.inf)
         # The history of a run begins with one box: rows that look farther back say nothing yet.
-        settled = np.isfinite(found).all(0)
+        settled = np.array(np.isfinite(found).all(0))
         return found if self._stays_finite(settled, far, added) else np.full_like(found, np.inf)
 
     def _stays_finite(self, states: np.ndarray, far: np.ndarray, added: np.ndarray) -> bool:
