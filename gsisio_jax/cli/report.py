@@ -48,7 +48,7 @@ def summarise(
         *([("units?", doubt(totals))] if doubt(totals) else []),
         ("unbounded", f"{totals.statuses['UNBOUNDED']} steps with a state that is not bounded"),
         *([("delay", _delay(outcome.boxes.delay))] if outcome.boxes.delay else []),
-        ("outside", _outside(totals, outcome)),
+        ("outside", said_outside(totals, outcome)),
         *([("resumed", f"after step {outcome.resumed:,}")] if outcome.resumed else []),
         ("design", f"{outcome.design_seconds:.2f} s"),
         ("compile", f"{outcome.compile_seconds:.2f} s"),
@@ -94,7 +94,8 @@ def outside(totals: Totals, outcome: Outcome) -> Outside:
     return Outside(totals.steps, totals.outside, totals.beyond, outcome.u_outside, totals.unread)
 
 
-def _outside(totals: Totals, outcome: Outcome) -> str:
+def said_outside(totals: Totals, outcome: Outcome) -> str:
+    """The line of the summary on steps without a promised width."""
     rates = outcome.observer.certificate.rates
     if rates is not None and rates.period > 1:
         return f"not counted: a width is promised while outputs come every {', '.join(map(str, rates.rates))} rows"

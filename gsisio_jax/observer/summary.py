@@ -94,7 +94,11 @@ def summary(est: Estimate, observer: Any = None, u: Any = None) -> str:
     ]
     if est.kept is not None:
         facts.insert(-1, ("outvoted", f"{_count(status, Status.OUTVOTED)} steps with an output that is not kept"))
-    if observer is not None and observer.certificate.rates is not None:
+    if (
+        observer is not None
+        and observer.certificate.rates is not None
+        and observer.certificate.rate_width.min() < np.inf
+    ):
         rates = observer.certificate.rates.rates
         facts[-1] = ("promise", f"by rows over several steps, while outputs come every {rates} rows: `rate_width`")
     elif observer is not None and not observer.certificate.self_consistent:

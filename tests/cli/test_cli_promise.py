@@ -9,7 +9,7 @@ import pytest
 from gsisio_jax import Interval
 from gsisio_jax.cli.boxes import record_type
 from gsisio_jax.cli.problem import Names
-from gsisio_jax.cli.report import certificate_lines, outside
+from gsisio_jax.cli.report import certificate_lines, outside, promised, said_outside
 from gsisio_jax.cli.totals import gather
 from gsisio_jax.observer.status import Status
 from gsisio_jax.observer.summary import Outside, summary, units_hint, where
@@ -21,6 +21,7 @@ def run(status, lower, upper):
     rows["status"], rows["state_lower"][:, 0], rows["state_upper"][:, 0] = status, lower, upper
     problem = SimpleNamespace(**{group: Names(("x",), ("",)) for group in ("state", "output")}, input=Names((), ()))
     certificate = SimpleNamespace(
+        rates=None,
         region=Interval([-1.0], [1.0]), certified=True, self_consistent=True, region_matters=True, recoverable=None,
         notes=(),
     )  # fmt: skip
@@ -45,6 +46,19 @@ def test_boxes_and_inputs_outside_are_counted_and_named():
     assert alone.startswith("holds: ")
     nowhere, _ = certificate_lines(certificate, problem, Outside(4, 4, 0, 4))
     assert nowhere.startswith("applies at no step of this run")
+
+
+def test_what_is_promised_for_rates_is_said_in_the_place_of_the_rest():
+    """Steps without the slow output are not counted as those without a promise; of inputs nothing is promised."""
+    totals, problem, certificate = run([2, 2, 0, 2], [-1] * 4, [0] * 4)
+    certificate.rates = SimpleNamespace(period=2, rates=(2,))
+    certificate.rate_width, certificate.region_matters = np.array([[0.5], [0.75]]), False
+    certificate.steady_width, certificate.input_width = np.array([2.0]), np.zeros(0)
+    (line,) = certificate_lines(certificate, problem, Outside(4, 4, 0, 4))
+    assert line.startswith("holds anywhere: while outputs come at the stated rates")
+    assert next(iter(promised(totals, certificate)))[1] == 0.75
+    outcome = SimpleNamespace(observer=SimpleNamespace(certificate=certificate))
+    assert said_outside(totals, outcome).startswith("not counted: ")
 
 
 @pytest.mark.parametrize(("conflicts", "steps", "said"), [(0, 0, False), (74, 100, False), (75, 100, True)])
@@ -73,7 +87,7 @@ def test_the_summary_of_an_estimate():
     state = Interval(np.array([[-2.0], [-1.0], [-0.5]]), np.array([[0.0], [1.0], [0.5]]))
     status = np.array([Status.OUTSIDE_REGION, Status.OUTSIDE_REGION | Status.MISSING, Status.OUTSIDE_REGION])
     est = SimpleNamespace(status=status, state=state, kept=None)
-    certificate = SimpleNamespace(region=Interval([-1.0], [1.0]), self_consistent=True, certified=True)
+    certificate = SimpleNamespace(region=Interval([-1.0], [1.0]), self_consistent=True, certified=True, rates=None)
     observer = SimpleNamespace(certificate=certificate, u_region=Interval([0.0], [1.0]))
     assert where(est) == Outside(3, 3, unread=2)  # and the step after that of which an output is missing
     assert where(est, observer, [[0.5], [0.5], [2.0]]) == Outside(3, 3, 1, 1, 2)
