@@ -158,9 +158,9 @@ def design_current(
         weights = np.asarray(observer.gains.residual[0])
         way = "" if everywhere.affine else what_split_gives(observer.certificate, noise, weights, on.slopes, box)
         observer = replace(observer, certificate=observer.certificate.with_notes(way))
-    if not (first.uncertified or observer.certificate.certified):
-        way = what_settles(plan, on, box)
-        observer = replace(observer, certificate=observer.certificate.with_notes(way))
+    unsettled = not (first.uncertified or observer.certificate.certified)
+    if unsettled and not everywhere.affine:
+        observer = replace(observer, certificate=observer.certificate.with_notes(what_settles(plan, on, box)))
     if not everywhere.affine:
         undefined, found = undefined_in(system, box, u_region), observer.certificate
         found = found.without_promise(undefined) if undefined else found
@@ -187,6 +187,8 @@ def design_current(
         rates = dials.rates or (1,) * problem.l
         found = rate_widths(problem, rates, observer.window, bank) if everywhere.affine else None
         observer = replace(observer, certificate=observer.certificate.with_rates(found, noise))
+    if unsettled and everywhere.affine and not observer.certificate.settles_by_rates:
+        observer = replace(observer, certificate=observer.certificate.with_notes(what_settles(plan, on, box)))
     observer = replace(observer, input_rows=rows_of_inputs(problem, system, dials.window, width, bank, observer.window))
     if maps is not None:
         rows_alone = dead_beat_rows(problem, maps, width) if guessed is None else guessed.rows(maps, width)

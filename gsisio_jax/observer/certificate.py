@@ -106,6 +106,11 @@ class Certificate(eqx.Module):
         return self.promised
 
     @property
+    def settles_by_rates(self) -> bool:
+        """All widths settle by rows over several steps, in every phase of `rates`."""
+        return self.rates is not None and bool(np.isfinite(self.rate_width).all())
+
+    @property
     def slack(self) -> np.ndarray:
         """Region width minus steady width, (n,)."""
         if not self.certified:
@@ -309,7 +314,7 @@ class Certificate(eqx.Module):
     def _headline(self) -> str:
         if not self.framer:
             return "Certificate: NONE. This recursion is NO framer: its boxes may cross and miss the truth."
-        if not self.certified and self.rates is not None and np.isfinite(self.rate_width).all():
+        if not self.certified and self.settles_by_rates:
             return "Certificate: widths settle by rows over several steps (below); the gain of one step promises none."
         if not self.certified:
             return "Certificate: NONE. The boxes are certain, but no bound on their width is promised."

@@ -65,6 +65,7 @@ def test_the_default_tracks_accelerations_nearly_as_well_as_the_whole_record():
     assert not certificate.certified
     np.testing.assert_allclose(width[-1], certificate.rate_width[0], rtol=1e-6)
     assert str(certificate).startswith("Certificate: widths settle by rows over several steps")
+    assert not any(note.startswith("widths would settle") for note in certificate.notes)
 
 
 def test_states_that_show_slowly_do_not_stay_infinite():
