@@ -19,7 +19,7 @@ from jax.core import Tracer
 
 from gsisio_jax._calls import named_arguments
 from gsisio_jax.interval import rounding
-from gsisio_jax.interval.cast import cast_down, cast_known, cast_up
+from gsisio_jax.interval.cast import cast_down, cast_known, cast_up, floating_type
 from gsisio_jax.interval.direct import absolute, minus, plus, where
 from gsisio_jax.interval.minmax import cut, larger, raised, smaller
 from gsisio_jax.interval.primitives import fusion_barrier
@@ -108,7 +108,7 @@ class Interval(eqx.Module):
     @property
     def dtype(self) -> Any:
         """Floating type of both bounds together."""
-        return jnp.result_type(self.lower, self.upper)
+        return floating_type(self.lower.dtype, self.upper.dtype)
 
     @property
     def center(self) -> Any:

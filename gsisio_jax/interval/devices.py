@@ -81,6 +81,7 @@ def _varied(value: Any, axes: frozenset[Any]) -> Any:
 
 def scan(body: Callable[..., Any], carry: Any, xs: Any, length: int | None = None) -> tuple[Any, Any]:
     """`jax.lax.scan`, whose carry may vary along more axes of the mesh behind a turn than before the first."""
+    length = given(length)
     if jax.sharding.get_abstract_mesh().empty:
         return jax.lax.scan(body, carry, xs, length=length)
     leaves, structure = jax.tree.flatten(carry)
@@ -96,6 +97,11 @@ def scan(body: Callable[..., Any], carry: Any, xs: Any, length: int | None = Non
         return jax.tree.unflatten(structure, cast(jax.tree.leaves(carry), axes)), out
 
     return jax.lax.scan(turn, jax.tree.unflatten(structure, cast(leaves, axes)), xs, length=length)
+
+
+def given(length: Any) -> int | None:
+    """A number of turns for `jax.lax.scan`, which finds it in the rows where it is a symbol (`jax.export`)."""
+    return length if isinstance(length, int) else None
 
 
 def merged(avals: Sequence[Any], shape: tuple[int, ...], dtype: Any, places: Sequence[Sequence[int | None]]) -> Any:

@@ -66,7 +66,12 @@ def entries(x: Any, axis: int = 0) -> list[Any]:
 def common_shape(*values: Any) -> tuple[int, ...]:
     """`numpy.broadcast_shapes` of these, which mostly have one shape."""
     shapes = {np.shape(value) for value in values}
-    return shapes.pop() if len(shapes) == 1 else np.broadcast_shapes(*shapes)
+    return shapes.pop() if len(shapes) == 1 else jnp.broadcast_shapes(*shapes)
+
+
+def is_symbolic(shape: Sequence[Any]) -> bool:
+    """A size is no number, but a symbol (`jax.export.symbolic_shape`)."""
+    return not all(isinstance(size, int) for size in shape)
 
 
 def common(values: Sequence[Any]) -> tuple[tuple[int, ...], Any]:
@@ -82,7 +87,7 @@ def alike(value: Any, shape: tuple[int, ...], dtype: Any) -> Any:
         value = np.asarray(value, dtype)
         if value.shape == shape:
             return value
-        few = math.prod(shape) <= _FEW
+        few = not is_symbolic(shape) and math.prod(shape) <= _FEW
         return np.broadcast_to(value, shape) if few else jnp.broadcast_to(value, shape)
     if value.dtype != dtype:
         value = lax.convert_element_type(value, dtype)

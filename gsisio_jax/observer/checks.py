@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._memo import memory, once_per_observer
 from gsisio_jax.interval.box import Interval, add, is_concrete
+from gsisio_jax.interval.cast import as_array, default_device, floating_type, looked_at
+from gsisio_jax.interval.direct import is_symbolic
 from gsisio_jax.interval.reading import check_type, read_array
 from gsisio_jax.interval.rounding import Rounding, check_rounding
 from gsisio_jax.observer.delayed import DelayedObserver
@@ -62,55 +66,100 @@ def prepare(
 ) -> tuple[Interval, Any, Any, Noise, AnyObserver]:
     """Check shapes (and values of concrete arrays), and bring everything to one dtype, bounds rounded outward."""
     observer = rounded(call, observer, rounding)
-    system = observer.system
+    n, l, m = _sizes(observer)
     if call != "step":  # which is called many times, and was checked by `start`
-        system.check_unchanged(call)
+        observer.system.check_unchanged(call)
     lead = "(T, " if rows else "("
-    check_type(call, "initial", initial, Interval, f"gx.Interval(lower, upper) of shape ({system.n},)")
-    if initial.shape != (system.n,):
+    check_type(call, "initial", initial, Interval, f"gx.Interval(lower, upper) of shape ({n},)")
+    lower, upper = initial.lower, initial.upper
+    if lower.shape != (n,):
         raise ValueError(
-            f"{call}: `initial` must be an Interval of shape ({system.n},), got {initial.shape}; for many boxes use "
-            "jax.vmap"
+            f"{call}: `initial` must be an Interval of shape ({n},), got {initial.shape}; for many boxes use jax.vmap"
         )
     y = read_array(call, "y" if rows else "the measurement", y, missing=True)
-    if y.ndim != 1 + rows or y.shape[-1] != system.l or (rows and y.shape[0] == 0 and call == "estimate"):
-        needed = f"(T, {system.l}) with T >= 1" if rows else f"({system.l},)"
-        raise ValueError(
-            f"{call}: measurements must have shape {needed}, got {y.shape}; {_hint(y.shape, system.l, rows)}"
-        )
-    if is_concrete(y) and np.isinf(np.asarray(y)).any():
+    shape = y.shape
+    if len(shape) != 1 + rows or shape[-1] != l or (rows and call == "estimate" and shape[0] == 0):
+        needed = f"(T, {l}) with T >= 1" if rows else f"({l},)"
+        raise ValueError(f"{call}: measurements must have shape {needed}, got {shape}; {_hint(shape, l, rows)}")
+    alone = is_concrete(y)
+    if alone and np.isinf(looked_at(y)).any():
         raise ValueError(f"{call}: a measurement is infinite; mark missing entries with NaN")
-    # Arrays of 64 bits may come where JAX has 32 by now: each type first by itself, which is silent.
-    dtype = jnp.result_type(*map(jax.dtypes.canonicalize_dtype, (initial.dtype, y.dtype)))
-    if not jnp.issubdtype(dtype, jnp.floating):
-        dtype = jnp.result_type(float)
-    dtype = jax.dtypes.canonicalize_dtype(dtype)
+    alone = alone and is_concrete(lower)
+    dtype = floating_type(lower.dtype, upper.dtype, y.dtype)
     if u is None:
-        if system.m > 0:
-            raise ValueError(f"{call}: the system has {system.m} known inputs; give `u` of shape {lead}{system.m})")
-        u = np.zeros((*y.shape[:-1], 0))
-    u = read_array(call, "u", u)
-    if np.shape(u) != (*y.shape[:-1], system.m):
-        raise ValueError(
-            f"{call}: `u` must have shape {(*y.shape[:-1], system.m)}, one row per measurement, got {np.shape(u)}"
-        )
-    if is_concrete(u) and not np.isfinite(np.asarray(u)).all():
-        raise ValueError(f"{call}: `u` must be finite in every row; a known input cannot be missing")
-    noise = observer.noise if noise is None else noise
-    check_type(call, "noise", noise, Noise, "gx.Noise(w, v)")
-    for name, box, size in (("w", noise.w, system.n), ("v", noise.v, system.l)):
-        legal = [(size,), (y.shape[0], size)] if rows else [(size,)]
-        if box.shape not in legal:
+        if m > 0:
+            raise ValueError(f"{call}: the system has {m} known inputs; give `u` of shape {lead}{m})")
+        u = _nothing((*shape[:-1], 0), dtype, alone)
+    else:
+        u = read_array(call, "u", u)
+        if np.shape(u) != (*shape[:-1], m):
             raise ValueError(
-                f"{call}: the noise bounds of `{name}` must have shape {' or '.join(map(str, legal))}, got {box.shape}"
+                f"{call}: `u` must have shape {(*shape[:-1], m)}, one row per measurement, got {np.shape(u)}"
+            )
+        if is_concrete(u) and not np.isfinite(looked_at(u)).all():
+            raise ValueError(f"{call}: `u` must be finite in every row; a known input cannot be missing")
+    if noise is None:
+        noise = _own_noise(observer, dtype, alone)
+    check_type(call, "noise", noise, Noise, "gx.Noise(w, v)")
+    w, v = noise.w, noise.v
+    for name, box, size in (("w", w, n), ("v", v, l)):
+        own = box.lower.shape
+        if own != (size,) and (not rows or own != (shape[0], size)):
+            legal = [(size,), (shape[0], size)] if rows else [(size,)]
+            raise ValueError(
+                f"{call}: the noise bounds of `{name}` must have shape {' or '.join(map(str, legal))}, got {own}"
             )
     if dtype != np.float64:
         observer = observer.astype(dtype)
     # What has that type already is left alone: every operation outside of a compiled program costs more than a step.
-    initial, w, v = (box if _has_type(box, dtype) else box.astype(dtype) for box in (initial, noise.w, noise.v))
+    initial, w, v = (box if _has_type(box, dtype) else box.astype(dtype) for box in (initial, w, v))
     noise = _with_lost(y, Noise.unchecked(w, v), dtype)
     y, u = (value if getattr(value, "dtype", None) == dtype else jnp.asarray(value, dtype) for value in (y, u))
     return initial, y, u, noise, observer
+
+
+@once_per_observer
+def _sizes(observer: AnyObserver) -> tuple[int, int, int]:
+    """States, outputs and known inputs. To ask Equinox for an attribute takes a microsecond, and these lie deep."""
+    system = observer.system
+    return system.n, system.l, system.m
+
+
+def _own_noise(observer: AnyObserver, dtype: Any, alone: bool) -> Noise:
+    """The noise of the design. Of a call with plain numbers it lies on the device, once: handed over at every step its
+    four arrays took as long as the step, and `jax.transfer_guard` refused them."""
+    if not alone:
+        return observer.noise
+    key = _own_noise, np.dtype(dtype), default_device()
+    known = memory(observer).get(key)
+    # A program may return the very array that it is given, and the user donate that one.
+    if known is not None and not any(side.is_deleted() for side in known[1]):
+        return known[0]
+    noise = observer.noise
+    w, v = (box if _has_type(box, dtype) else box.astype(dtype) for box in (noise.w, noise.v))
+    noise = Noise.unchecked(w, v)
+    if all(map(is_concrete, jax.tree.leaves(noise))):
+        with jax.ensure_compile_time_eval():  # what is remembered must not belong to a program that is traced
+            noise = jax.tree.map(as_array, noise)
+        memory(observer)[key] = noise, jax.tree.leaves(noise)
+    return noise
+
+
+def _nothing(shape: tuple[Any, ...], dtype: Any, alone: bool) -> Any:
+    """Known inputs where there are none."""
+    if not alone:  # the number of rows may be a symbol (`jax.export`)
+        return jnp.zeros(shape, dtype) if is_symbolic(shape) else np.zeros(shape)
+    found = _empty(shape, np.dtype(dtype), default_device())
+    if found.is_deleted():  # see `_own_noise`
+        _empty.cache_clear()
+        found = _empty(shape, np.dtype(dtype), default_device())
+    return found
+
+
+@lru_cache(64)
+def _empty(shape: tuple[int, ...], dtype: Any, device: Any) -> Any:
+    with jax.ensure_compile_time_eval():
+        return as_array(np.zeros(shape, dtype))
 
 
 def _hint(shape: tuple[int, ...], outputs: int, rows: bool) -> str:

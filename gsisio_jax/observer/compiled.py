@@ -39,6 +39,11 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     options = cache(lambda: _options())
 
+    @wraps(function)
+    def kept_inside(static: Fixed | None, traced: Any, *args: Any) -> Any:
+        *data, hold = args
+        return jax.checkpoint(lambda *data: function(static, traced, *data, hold))(*data)
+
     def alone(value: Any) -> Callable[..., Any]:
         return jax.jit(partial(function, None, value), static_argnames="hold", compiler_options=options())
 
@@ -54,7 +59,10 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
             except ValueError as error:  # constants inside of another program
                 if "compiler_options" not in str(error):
                     raise
-        return jitted(function, static, traced, ("hold",))(*args)
+        # A missing measurement is NaN, also in what a gradient outside of `jax.jit` keeps of the run: `jax_debug_nans`
+        # would take that for an error. Computed again it stays inside of a program.
+        debugged = getattr(jax.config, "jax_debug_nans")  # noqa: B009 (pyright knows no such name)
+        return jitted(kept_inside if debugged else function, static, traced, ("hold",))(*args)
 
     return run
 

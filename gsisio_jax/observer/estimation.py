@@ -214,7 +214,7 @@ def step(
     """
     check_type("step", "carry", carry, Carry, "it comes from gx.start, and then from every gx.step")
     box, y_k, u_k, noise, observer = prepare("step", observer, carry.state, y_k, u_k, noise, False, rounding)
-    return _step(*fixed(observer), _as(carry, box.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))
+    return _step(*fixed(observer), _as(carry, box.lower.dtype), y_k, u_k, noise, check_on_conflict("step", on_conflict))
 
 
 @named_arguments
@@ -234,7 +234,7 @@ def resume(
     """
     check_type("resume", "carry", carry, Carry, "it comes from gx.start, and then from every gx.step")
     box, y, u, noise, observer = prepare("resume", observer, carry.state, y, u, noise, True, rounding)
-    return _resume(*fixed(observer), _as(carry, box.dtype), y, u, noise, check_on_conflict("resume", on_conflict))
+    return _resume(*fixed(observer), _as(carry, box.lower.dtype), y, u, noise, check_on_conflict("resume", on_conflict))
 
 
 def _as(carry: Carry, dtype: Any) -> Carry:
@@ -254,7 +254,7 @@ def collect(observer: AnyObserver, outputs: Sequence[StepOutput]) -> Estimate:
         raise ValueError(f"collect: `outputs` must be a list of what gx.start, gx.step and resume return, got {got}")
     for out in outputs:
         check_type("collect", "outputs", out, StepOutput, "the second of what gx.start, gx.step and resume return")
-    rows = [jax.tree.map(lambda x: x[None], out) if jnp.ndim(out.status) == 0 else out for out in outputs]
+    rows = [jax.tree.map(lambda x: jnp.expand_dims(x, 0), out) if jnp.ndim(out.status) == 0 else out for out in outputs]
     return _as_estimate(observer, jax.tree.map(lambda *x: jnp.concatenate(x), *rows))
 
 
@@ -291,8 +291,14 @@ def _resume(static: Fixed | None, traced: Any, carry: Carry, y: Any, u: Any, noi
 
 def _as_estimate(observer: AnyObserver, out: StepOutput) -> Estimate:
     delay = observer.delay if isinstance(observer, DelayedObserver) else 0
-    out = jax.tree.map(lambda rows: rows[delay:], out) if delay else out  # the first rows finish no step
+    out = jax.tree.map(lambda rows: _from(rows, delay), out) if delay else out  # the first rows finish no step
+    inputs = jax.tree.map(lambda rows: _from(rows, 1), out.input)
     return Estimate(
-        out.state, out.input[1:], out.current_input, out.status, out.margin, out.source, observer.output_rows,
+        out.state, inputs, out.current_input, out.status, out.margin, out.source, observer.output_rows,
         observer.guaranteed, delay, out.kept,
     )  # fmt: skip
+
+
+def _from(rows: Any, first: int) -> Any:
+    """``rows[first:]``; written so, JAX would copy the index to the device where nothing is traced."""
+    return jax.lax.slice_in_dim(rows, first, None)

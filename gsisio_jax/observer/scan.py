@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gsisio_jax import scalar
 from gsisio_jax._memo import once
 from gsisio_jax.interval import devices
-from gsisio_jax.interval.box import Interval
+from gsisio_jax.interval.box import Interval, is_concrete
+from gsisio_jax.interval.cast import as_array
 from gsisio_jax.observer import delayed, prediction_step, tolerant
 from gsisio_jax.observer import step as current_step
 from gsisio_jax.observer.checks import AnyObserver
@@ -128,4 +131,11 @@ def noise_of_row(noise: Noise, row: Noise) -> Noise:
 
 def cut(y: Any, length: Any) -> Any:
     """A ragged record: rows behind `length` are missing."""
+    if isinstance(y, np.ndarray) and is_concrete(length):
+        return np.where((np.arange(len(y)) < np.asarray(length))[:, None], y, np.asarray(np.nan, y.dtype))
+    return _cut(y, length if isinstance(length, jax.Array) else as_array(length))
+
+
+@partial(jax.jit, inline=True)
+def _cut(y: Any, length: Any) -> Any:
     return jnp.where((jnp.arange(y.shape[0]) < length)[:, None], y, jnp.nan)

@@ -77,7 +77,7 @@ def scan(
     columns = tuple(entry for leaf in rows for entry in _entries(leaf, 1))
     everything = devices.agreeing([*consts, *numbers, *columns])
     consts, numbers, columns = _split(everything, len(consts), count)
-    last, kept = jax.lax.scan(step, numbers, columns, length=turns)
+    last, kept = jax.lax.scan(step, numbers, columns, length=devices.given(turns))
     leaves = program.results
     packed = _packed([*last], leaves[: len(flat_carry)], ()) + _packed(
         [entry.reshape(turns) for entry in kept], leaves[len(flat_carry) :], (turns,)
