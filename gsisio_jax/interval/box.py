@@ -163,6 +163,7 @@ class Interval(eqx.Module):
     __truediv__ = __rtruediv__ = __pow__ = __rpow__ = __neg__ = __abs__ = _no_arithmetic
     __lt__ = __le__ = __gt__ = __ge__ = _no_arithmetic
 
+    @named_arguments
     def contains(self, value: Any, margin: float = 0.0) -> Any:
         """Elementwise: is ``value`` inside, with `margin` to spare?
 

@@ -63,6 +63,19 @@ def test_two_types_where_promotion_is_strict(observer):
         assert cast.floating_type(np.float32, jnp.bfloat16) == np.float32
 
 
+def test_shapes_where_promotion_of_ranks_is_refused(observer):
+    def width(y):
+        return gx.estimate(observer, BOX, y).state.width[-1, 0]
+
+    y = jnp.asarray(np.nan_to_num(Y))
+    found = jax.jit(jax.vmap(jax.value_and_grad(width)))
+    expected = found(y[None])
+    with jax.numpy_rank_promotion("raise"):
+        equal(found(y[None]), expected)
+        gx.design_observer(observer.system, NOISE, Interval.symmetric([1.0]))
+        assert jax.device_put(BOX).contains(y).all()
+
+
 def test_gradients_outside_of_jit_where_nan_is_an_error(observer):
     def width(w):
         return gx.estimate(observer, BOX, Y, noise=gx.Noise(Interval.symmetric(w), NOISE.v)).state.width[-1, 0]
