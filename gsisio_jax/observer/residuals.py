@@ -34,6 +34,22 @@ def exact(matrix: Any) -> Any:
     return _exact(matrix) if matrix.size else np.zeros(matrix.shape, object)
 
 
+def product(a: Any, b: Any) -> Any:
+    """``a.dot(b)`` of two matrices of fractions, over whole numbers: all come from floating numbers, so the largest
+    denominator, a power of two, is a common one. Fractions would look for a common divisor at every sum."""
+    if not a.size or not b.size:
+        return a.dot(b)
+    (over, a), (under, b) = _whole(a), _whole(b)
+    whole = a.dot(b)
+    return np.array([Fraction(value, over * under) for value in whole.ravel()], object).reshape(whole.shape)
+
+
+def _whole(matrix: Any) -> tuple[int, Any]:
+    largest = max(value.denominator for value in matrix.flat)
+    whole = [value.numerator * (largest // value.denominator) for value in matrix.flat]
+    return largest, np.array(whole, object).reshape(matrix.shape)
+
+
 def rounded_up(matrix: Any) -> np.ndarray:
     """Magnitudes of a matrix of fractions as float64, at or above."""
     up = np.array([_up(abs(value)) for value in np.ravel(matrix)], np.float64)
@@ -67,12 +83,12 @@ def cancellation_residual(
     for k in range(len(bank.residual)):
         A, B = exact(bank.residual[k][:, :n]), exact(bank.residual[k][:, n:])
         Z, Sb, Kd = exact(bank.remainder[k]), exact(bank.bounds[k]), exact(bank.known[k])
-        found = A + Z.dot(C) + Sb.dot(S)
+        found = A + product(Z, C) + product(Sb, S)
         if bank.state is not None:
             found = found + exact(bank.state[k])
         of_x.append(rounded_up(eye_x - found if states else -found))
-        through = A.dot(G) + B.dot(H) - Kd.dot(D)
-        of_d.append(rounded_up(abs(through if states else eye_d + through) + abs(B).dot(slack)))
+        through = product(A, G) + product(B, H) - product(Kd, D)
+        of_d.append(rounded_up(abs(through if states else eye_d + through) + product(abs(B), slack)))
     rows = n if states else p
     count = len(bank.residual)
     return CancellationResidual(np.array(of_x).reshape(count, rows, n), np.array(of_d).reshape(count, rows, p))
@@ -90,8 +106,8 @@ def row_cancellation_residual(
     flat, flat_known = rows.reshape(count, rows.shape[-1]), known.reshape(count, known.shape[-1])
     p = S.shape[1]
     target = exact(np.tile(np.eye(p), (len(flat) // p if p else 0, 1)) if identity else np.zeros((len(flat), p)))
-    left = target - exact(flat).dot(S) - exact(flat_known).dot(D)
-    return rounded_up(abs(left) + abs(exact(flat)).dot(slack)).reshape(*rows.shape[:-1], p)
+    left = target - product(exact(flat), S) - product(exact(flat_known), D)
+    return rounded_up(abs(left) + product(abs(exact(flat)), slack)).reshape(*rows.shape[:-1], p)
 
 
 def window_residual(window: Any, plant: Any, C: Any, bounded: Any, H_slack: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -100,12 +116,12 @@ def window_residual(window: Any, plant: Any, C: Any, bounded: Any, H_slack: Any)
     n = plant.n
     G, H, C, D, slack = (exact(m) for m in (plant.G, plant.H, C, bounded, H_slack))
     target = exact(np.eye(n)[list(window.targets)])
-    x = target - exact(window.multipliers[0][:, :n]) - exact(window.remainder).dot(C)
+    x = target - exact(window.multipliers[0][:, :n]) - product(exact(window.remainder), C)
     d = []
     for weights, known in zip(window.multipliers, window.known, strict=True):
         of_f, of_g = exact(weights[:, :n]), exact(weights[:, n:])
-        through = of_f.dot(G) + of_g.dot(H) - exact(known).dot(D)
-        d.append(rounded_up(abs(through) + abs(of_g).dot(slack)))
+        through = product(of_f, G) + product(of_g, H) - product(exact(known), D)
+        d.append(rounded_up(abs(through) + product(abs(of_g), slack)))
     return rounded_up(x), np.array(d).reshape(len(window.known), len(x), plant.p)
 
 
@@ -114,15 +130,15 @@ def input_row_residual(rows: Any, plant: Any, H_slack: Any) -> tuple[np.ndarray,
     `window_residual`."""
     n, N, (G, H, slack) = plant.n, rows.length, (exact(m) for m in (plant.G, plant.H, H_slack))
     output, ahead, moves = exact(rows.output), exact(rows.ahead), [exact(part) for part in rows.moves]
-    now = rounded_up(abs(output.dot(H) - ahead) + abs(output).dot(slack))
+    now = rounded_up(abs(product(output, H) - ahead) + product(abs(output), slack))
     found = []
     for lag in range(N):
         of_f, of_g = exact(rows.multipliers[lag][:, :n]), exact(rows.multipliers[lag][:, n:])
-        left = of_f.dot(G) + of_g.dot(H) - exact(rows.boxes[lag]) - moves[lag]
+        left = product(of_f, G) + product(of_g, H) - exact(rows.boxes[lag]) - moves[lag]
         left = left + (moves[lag - 1] if lag else ahead)
         if lag < rows.over:
             left = left - exact(np.eye(plant.p)[list(rows.targets)])
-        found.append(rounded_up(abs(left) + abs(of_g).dot(slack)))
+        found.append(rounded_up(abs(left) + product(abs(of_g), slack)))
     return np.array(found).reshape(N, len(rows.targets), plant.p), now.reshape(len(rows.targets), plant.p)
 
 
@@ -146,7 +162,7 @@ def upper_inverse(M: np.ndarray) -> np.ndarray | None:
         if spectral_radius(larger) >= 1:
             return None
         V = np.where(linked, np.maximum(np.linalg.inv(np.eye(n) - larger), 0.0), 0.0)
-        if (exact(V).dot(left) >= wanted).all():
+        if (product(exact(V), left) >= wanted).all():
             return V
     return None
 
@@ -154,7 +170,7 @@ def upper_inverse(M: np.ndarray) -> np.ndarray | None:
 def nearest_feedthrough(T2: Any, H: Any) -> np.ndarray:
     """How far, entry by entry, an H that T2 annihilates exactly is from the one that is written: 0 if that one is."""
     H = np.asarray(H, np.float64)
-    if not T2.shape[0] or not exact(T2).dot(exact(H)).any():
+    if not T2.shape[0] or not product(exact(T2), exact(H)).any():
         return np.zeros_like(H)
     # The decimals of the user differ from their floating numbers by half an ulp; T2 is exact for the decimals.
     return np.spacing(np.abs(H)) * (H != 0)

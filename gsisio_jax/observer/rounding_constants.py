@@ -26,6 +26,7 @@ from gsisio_jax.observer.residuals import (
     exact,
     input_row_residual,
     nearest_feedthrough,
+    product,
     rounded_up,
     row_cancellation_residual,
     upper_inverse,
@@ -214,7 +215,7 @@ def with_output(bank: LinearBounds, T2: Any) -> LinearBounds:
 
 def _rounded_once(remainder: np.ndarray, T2: Any) -> np.ndarray:
     """``remainder T2`` (r, l) in float64."""
-    return np.asarray(exact(remainder).dot(exact(T2)), np.float64).reshape(len(remainder), T2.shape[1])
+    return np.asarray(product(exact(remainder), exact(T2)), np.float64).reshape(len(remainder), T2.shape[1])
 
 
 def _cast_window(window: Any, left_x: np.ndarray, left_d: np.ndarray, T2: np.ndarray, dtype: Any) -> Any:
@@ -254,7 +255,7 @@ def _slope(weights: np.ndarray, slopes: Slopes, n: int) -> np.ndarray:
     F, radius = np.vstack([slopes.F, slopes.E]), np.vstack([slopes.F_radius, slopes.E_radius])
     if not np.isfinite(radius).all():
         return np.full((len(weights), n), np.inf)
-    joint = rounded_up(exact(weights).dot(exact(F))) if weights.size else np.zeros((len(weights), n))
+    joint = rounded_up(product(exact(weights), exact(F))) if weights.size else np.zeros((len(weights), n))
     return (joint + np.abs(weights) @ radius) * (1 + 1e-14)
 
 
@@ -271,13 +272,13 @@ def _solved(N_z: Any, Q: Any, form: AffineForm, slack: Any, C: Any, dtype: Any) 
     if not offset[used].all():
         return None
     S = np.asarray(form.slope, np.float64)
-    A = exact(np.eye(n)) + exact(N_z[:, used]).dot(exact(S[used]) - exact(np.asarray(C)[used]))
+    A = exact(np.eye(n)) + product(exact(N_z[:, used]), exact(S[used]) - exact(np.asarray(C)[used]))
     plain = np.array(A, np.float64).reshape(n, n)
     if abs(np.linalg.det(plain)) <= 1e-6:
         return None
     K = np.asarray(np.linalg.inv(plain), dtype)
     K = np.where(np.abs(K) < 1e-13 * np.abs(K).max(initial=0.0), 0, K)
-    missed = rounded_up(exact(np.eye(n)) - exact(K).dot(A))
+    missed = rounded_up(exact(np.eye(n)) - product(exact(K), A))
     with np.errstate(invalid="ignore"):  # where there is no bound: refused below
         left = (missed + np.abs(np.float64(K)) @ (np.abs(N_z) @ slack + Q)) * _UP
     V = upper_inverse(left)
