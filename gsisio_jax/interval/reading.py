@@ -77,7 +77,9 @@ def _numbers(value: Any, missing: bool) -> Any:
     if isinstance(value, np.ma.MaskedArray):
         return _of_masked(value, missing)
     _check_kind(value)
-    if type(value).__module__.split(".")[0] == "pandas" and hasattr(value, "dtype" if value.ndim == 1 else "dtypes"):
+    # A single date of pandas (`Timestamp`) has no columns.
+    columns = {1: "dtype", 2: "dtypes"}.get(getattr(value, "ndim", 0))
+    if type(value).__module__.split(".")[0] == "pandas" and columns and hasattr(value, columns):
         return _of_pandas(value, missing)
     if hasattr(value, "to_numpy"):  # xarray, polars
         return _numbers(value.to_numpy(), missing)

@@ -83,7 +83,7 @@ CALLS = {
     "step swapped": (lambda o: gx.discretize(0.1, f, region=BOX), "discretize: `dt`", "type function"),
     "step on a pair": (lambda o: gx.discretize(f, 0.1, region=([0, 0], [1, 1])), "discretize: `region`", "got tuple"),
     "step everywhere": (
-        lambda o: gx.discretize(lambda x: jnp.sin(x), 0.1, region=Interval.entire(2)),
+        lambda o: gx.discretize(lambda x: jnp.cosh(x), 0.1, region=Interval.entire(2)),
         "discretize: `region` must be finite",
         "bound=False",
     ),

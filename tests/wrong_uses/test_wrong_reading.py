@@ -99,7 +99,8 @@ READ = {
     "truth masked": (sweep(BOX, Y, truth=(np.ma.array(np.zeros((3, 2)), mask=True), None)), "sweep: `truth`", "masked"),
     "sweep y by name": (sweep(BOX, {"a": Y}), "sweep: `y`", "columns by name (a)"),
     "sweep y dates": (sweep(BOX, DATES), "sweep: `y`", "dates or times"),
-    "time of dates": (sweep(BOX, Y, time=DATES), "sweep: `time`", "dates or times", "seconds"),
+    "y with a date": (estimate(BOX, [[1.0], [DATES[0]], [2.0]]), "estimate: `y`", "dates or times"),
+    "time of a list of dates": (sweep(BOX, Y, time=list(DATES)), "sweep: `time`", "dates or times", "seconds"),
     "masked labels": (lambda o: gx.grid("a", Y, np.ma.array([1, 2], mask=[0, 1])), "grid: `coordinate`", "masked"),
     "records by name": (lambda o: Records(BOX, {"y": Y}), "Records: `y`", "columns by name (y)"),
     "records u masked": (
