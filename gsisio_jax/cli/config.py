@@ -214,7 +214,7 @@ def _did_you_mean(location: tuple[int | str, ...]) -> str:
         else:
             named = False
     known = [] if model is None else [field.alias or name for name, field in model.model_fields.items()]
-    close = difflib.get_close_matches(str(location[-1]), known, n=1)
+    close = difflib.get_close_matches(str(location[-1]), known, n=1, cutoff=0.65)  # "rates" is no misspelt "tolerate"
     if close:
         return f"; did you mean {close[0]}?"
     return f"; the keys here are: {', '.join(known)}" if known else ""
