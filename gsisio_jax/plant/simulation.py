@@ -126,7 +126,7 @@ def _simulate(system: System, key: Any, x0: Any, d: Any, noise: Noise, u: Any) -
 
     def draw(key: Any, box: Interval) -> Any:
         share = jax.random.uniform(key, box.shape, box.lower.dtype)
-        return box.lower + share * (box.upper - box.lower)
+        return jnp.clip(box.lower + share * (box.upper - box.lower), box.lower, box.upper)
 
     def step(x: Any, inputs: Any) -> tuple[Any, Any]:
         d_k, u_k, w_k, v_k, box_w, box_v = inputs
@@ -156,7 +156,8 @@ def _add(base: Any, noise: Any, box: Interval) -> tuple[Any, Any]:
     margin = 4 * jnp.finfo(total.dtype).eps * jnp.abs(total)
     low, high = jnp.minimum(box.lower + margin, box.center), jnp.maximum(box.upper - margin, box.center)
     inner = jnp.clip(noise, low, high)
-    total = jnp.where(box.contains(total - base), total, base + inner)
+    # What was drawn outside of its bounds stays there: an output that may be wrong, or a run that breaks them.
+    total = jnp.where(box.contains(total - base) | ~box.contains(noise), total, base + inner)
     return total, total - base
 
 

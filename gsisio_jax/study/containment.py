@@ -16,8 +16,10 @@ from gsisio_jax.study.later import delay_of
 from gsisio_jax.study.reduction_base import Context, Kept, Variable
 from gsisio_jax.study.truth import Coverage
 
-# The simulated plant rounds where the real one would not, so noise on its very bounds may push the truth out of a box
-# by some units in the last place. Relative to the truth and the width of its box; double and single precision.
+# Where noise has no room to keep off its bounds, the simulated plant rounds where the real one would not, and that may
+# push the truth out of a box by some units in the last place. Relative to the truth and to the width of its box, or to
+# the width that boxes settle at where that is less: what a wider box says of the truth is not what was rounded. Double
+# and single precision. A truth that is known to be exact gets no slack.
 SLACK = {True: 1e-9, False: 1e-3}
 
 
@@ -34,17 +36,18 @@ BROKEN = (
 
 @dataclass(frozen=True)
 class Containment(Coverage):
-    """`Coverage` up to rounding, and the first step at which a box missed the truth."""
+    """`Coverage` up to the rounding of the truth, and the first step at which a box missed it."""
 
     double: bool
 
-    def compare(self, total: Any, box: Interval, truth: Any) -> Any:
+    def compare(self, total: Any, box: Interval, truth: Any, exact: Any = False, usual: Any = jnp.inf) -> Any:
         below, above = box.lower - truth, truth - box.upper
         outside = jnp.maximum(below, above)
         # The width says how large the numbers are that were rounded; an infinite one says nothing of the other side.
         size = jnp.where(jnp.isfinite(box.width), box.width, jnp.abs(jnp.where(below > above, box.lower, box.upper)))
-        size = jnp.abs(truth) + jnp.where(jnp.isfinite(size), size, 0)
-        outside = jnp.where(outside <= SLACK[self.double] * size, jnp.minimum(outside, 0), outside)
+        size = jnp.abs(truth) + jnp.minimum(jnp.where(jnp.isfinite(size), size, 0), usual)
+        rounded = (outside <= SLACK[self.double] * size) & ~jnp.asarray(exact)
+        outside = jnp.where(rounded, jnp.minimum(outside, 0), outside)
         outside = jnp.where(jnp.isnan(box.lower) | jnp.isnan(box.upper), jnp.inf, outside)  # no box holds anything
         return total[0] + (outside <= 0), jnp.maximum(total[1], outside)
 

@@ -104,7 +104,7 @@ def _case(
             row, carried = source.following(observer, case, carried, k, given)
             x, d = row.x, row.d
         carry, out = scan.advance(observer, carry, row.y, row.u, row.noise, hold)
-        context = Context(steady, nearest(observer, x, out.state), d)
+        context = Context(steady, nearest(observer, x, out.state), d, row.exact)
         counts = None if length is None and not delay else (k >= 0) & (k < count)
         after, kept = [], []
         for reduction, before in zip(reductions, states, strict=True):
@@ -142,7 +142,7 @@ def _start(
     that waits for its boxes where the observer has a delay (states and boxes say nothing yet then)."""
     row, carried = source.first(observer, case)
     carry, out = scan.begin(observer, case["initial"], row.y, row.u, row.noise, hold)
-    context, zero = Context(case["steady"], nearest(observer, row.x, out.state), row.d), jnp.int32(0)
+    context, zero = Context(case["steady"], nearest(observer, row.x, out.state), row.d, row.exact), jnp.int32(0)
     states = [r.row(out, zero, context) if isinstance(r, Kept) else r.init(out, context) for r in reductions]
     delay = later.delay_of(observer)
     return carry, carried, jax.tree.map(jnp.asarray, states), out, later.waiting(row, delay) if delay else None

@@ -14,8 +14,7 @@ from gsisio_jax.files.program import lines
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer import scan
 from gsisio_jax.observer.tolerant import TolerantObserver
-from gsisio_jax.plant.simulation import measured, moved
-from gsisio_jax.study import containment
+from gsisio_jax.study import certain, containment
 from gsisio_jax.study.containment import BROKEN
 from gsisio_jax.study.reduction_base import Variable
 from gsisio_jax.study.row_source import Row, Rows
@@ -32,6 +31,7 @@ class Simulated(Rows):
         draw: "uniform", "vertices", or ``draw(key, k, x, noise)`` -> (w, v).
         x0: ``x0(key)`` -> (n,), or None: the array or box ``x0`` of the case.
         on_miss: "raise" or "record".
+        strict: noise is to lie in its bounds for certain (`study.certain`), wherever these leave room for rounding.
     """
 
     length: int
@@ -40,6 +40,7 @@ class Simulated(Rows):
     draw: str | Callable[..., Any]
     x0: Callable[..., Any] | None
     on_miss: str = field(compare=False)  # the program is the same
+    strict: bool = False
 
     def steps(self, case: Any) -> int:
         return self.length
@@ -56,8 +57,8 @@ class Simulated(Rows):
             x = case["x0"]
         start = jnp.where(case["initial"].contains(x).all(), 0, 1)
         zero = jnp.zeros(system.p, dtype)
-        row, plant, outside = self._measure(observer, case, key, jnp.int32(0), x, zero, _row(case, 0))
-        return row, (key, plant, _first_break(jnp.full(2, -1, jnp.int32), 0, start | outside, row))
+        row, plant, outside = self._measure(observer, case, key, jnp.int32(0), x, zero, _row(case, 0), self.strict)
+        return row, (key, plant, _first_break(jnp.full(2, -1, jnp.int32), 0, start | outside, row), row.exact)
 
     def given(self, case: Any) -> Any:
         noise = jax.tree.map(lambda a: a[1:], scan.noise_rows(case["noise"]))
@@ -65,15 +66,15 @@ class Simulated(Rows):
         return case["u"][1:], noise, d
 
     def following(self, observer: Any, case: Any, carried: Any, k: Any, given: Any) -> tuple[Row, Any]:
-        key, (x, d, u, w, w_bounds), broken = carried
+        key, (x, d, u, w, w_bounds), broken, exact = carried
         system = observer.system
-        x, _ = moved(system, x, d, u, w, w_bounds)
+        x, within = certain.next_state(system, x, d, u, w, w_bounds, self.strict)
         left = jnp.where(system.state_bounds.contains(x).all(), 0, 2)
-        row, plant, outside = self._measure(observer, case, key, k, x, d, given)
-        return row, (key, plant, _first_break(broken, k, outside | left, row))
+        row, plant, outside = self._measure(observer, case, key, k, x, d, given, exact & within)
+        return row, (key, plant, _first_break(broken, k, outside | left, row), row.exact)
 
     def results(self, carried: Any) -> dict[str, Any]:
-        _, (x, *_), (at, what) = carried
+        _, (x, *_), (at, what), _ = carried
         return {"broken_at": jnp.where(at < 0, jnp.nan, at).astype(x.dtype), "broken": jnp.maximum(what, 0)}
 
     def describe(self) -> dict[str, Variable]:
@@ -89,7 +90,7 @@ class Simulated(Rows):
     def identity(self, observer: Any) -> tuple[str, list[Any]]:
         key, k, x = jax.random.key(0, impl=self.impl), jnp.int32(0), jnp.zeros(observer.system.n)
         given = (self.x0, (key,)), (self.d, (key, k, x)), (self.draw, (key, k, x, observer.noise))
-        text = [f"Simulated {self.length} {self.impl}"]
+        text = [f"Simulated {self.length} {self.impl} {self.strict}"]
         for function, arguments in given:
             if callable(function):
                 text += lines(jax.make_jaxpr(function)(*arguments))
@@ -97,8 +98,9 @@ class Simulated(Rows):
                 text.append(str(function))
         return "\n".join(text), []
 
-    def _measure(self, observer: Any, case: Any, key: Any, k: Any, x: Any, before: Any, given: Any) -> Any:
-        """Row k; what moves the plant on to x[k+1]: x, d, u, w and its bounds; and what is outside of its bounds."""
+    def _measure(self, observer: Any, case: Any, key: Any, k: Any, x: Any, before: Any, given: Any, exact: Any) -> Any:
+        """Row k; what moves the plant on to x[k+1]: x, d, u, w and its bounds; and what is outside of its bounds.
+        `exact`: all noise before was within them for certain."""
         system, (u, now, d) = observer.system, given
         noise = scan.noise_of_row(case["noise"], now)
         key_d, key_noise = jax.random.split(jax.random.fold_in(key, k))
@@ -114,8 +116,8 @@ class Simulated(Rows):
             w, v = (_inside(key, box, self.draw == "vertices") for key, box in ((key_w, noise.w), (key_v, noise.v)))
             legal = True
         outside = jnp.where(system.input_bounds.contains(d).all(), 0, 4) | jnp.where(legal, 0, 8)
-        y, _ = measured(system, x, d, u, v, noise.v)
-        return Row(y, u, noise, x, before), (x, d, u, w, noise.w), outside
+        y, within = certain.measurement(system, x, d, u, v, noise.v, self.strict)
+        return Row(y, u, noise, x, before, jnp.asarray(exact & within)), (x, d, u, w, noise.w), outside
 
 
 def tolerated(observer: Any) -> int:

@@ -19,11 +19,13 @@ class Context(NamedTuple):
         steady: (n,) state width that the certificate promises for the noise of the case.
         x: (n,) true state x[k], or None.
         d: (p,) true input d[k-1] (meaningless at k = 0), or None.
+        exact: that truth is known to be one of the plant as stated; else it may be off by rounding.
     """
 
     steady: Any
     x: Any = None
     d: Any = None
+    exact: Any = False
 
 
 class Variable(NamedTuple):

@@ -23,6 +23,7 @@ class Row(NamedTuple):
         noise: bounds of the step.
         x: (n,) true state x[k], or None.
         d: (p,) true input d[k-1], or None; zeros at k = 0.
+        exact: the truth is one of the plant as stated, up to here and without any rounding.
     """
 
     y: Any
@@ -30,6 +31,7 @@ class Row(NamedTuple):
     noise: Noise
     x: Any = None
     d: Any = None
+    exact: Any = False
 
 
 class Rows:

@@ -17,7 +17,8 @@ class _Truth(Reduction):
 
     needs_truth = True
 
-    def compare(self, total: Any, box: Interval, truth: Any) -> Any:
+    def compare(self, total: Any, box: Interval, truth: Any, exact: Any = False, usual: Any = jnp.inf) -> Any:
+        """The totals after one more step; `exact`: the truth is not rounded, `usual`: width that boxes settle at."""
         raise NotImplementedError
 
     def results(self, total: Any, count: Any) -> dict[str, Any]:
@@ -26,11 +27,13 @@ class _Truth(Reduction):
     def init(self, first: StepOutput, context: Context) -> Any:
         zero = jnp.zeros_like(first.state.lower), jnp.zeros_like(first.state.lower)
         none = jnp.zeros_like(first.input.lower), jnp.zeros_like(first.input.lower)
-        return self.compare(zero, first.state, context.x), None if context.d is None else none
+        compared = self.compare(zero, first.state, context.x, context.exact, context.steady)
+        return compared, None if context.d is None else none
 
     def update(self, state: Any, out: StepOutput, k: Any, context: Context) -> Any:
         x, d = state
-        return self.compare(x, out.state, context.x), None if d is None else self.compare(d, out.input, context.d)
+        x = self.compare(x, out.state, context.x, context.exact, context.steady)
+        return x, None if d is None else self.compare(d, out.input, context.d, context.exact)
 
     def finish(self, state: Any, steps: Any, context: Context) -> dict[str, Any]:
         named = {f"state_{key}": value for key, value in self.results(state[0], steps).items()}
@@ -48,7 +51,7 @@ class Coverage(_Truth):
 
     name = "coverage"
 
-    def compare(self, total: Any, box: Interval, truth: Any) -> Any:
+    def compare(self, total: Any, box: Interval, truth: Any, exact: Any = False, usual: Any = jnp.inf) -> Any:
         outside = jnp.maximum(box.lower - truth, truth - box.upper)
         return total[0] + (outside <= 0), jnp.maximum(total[1], outside)
 
@@ -72,7 +75,7 @@ class Error(_Truth):
 
     name = "error"
 
-    def compare(self, total: Any, box: Interval, truth: Any) -> Any:
+    def compare(self, total: Any, box: Interval, truth: Any, exact: Any = False, usual: Any = jnp.inf) -> Any:
         finite = jnp.isfinite(box.lower) & jnp.isfinite(box.upper)
         error = jnp.where(finite, jnp.abs(box.center - truth), jnp.inf)
         return total[0] + error**2, jnp.maximum(total[1], error)
