@@ -105,7 +105,8 @@ def design_current(
     outputs, slack = on.outputs(system.state_bounds)
 
     def assembled(gains: list[np.ndarray], scale: np.ndarray) -> Observer:
-        inputs = input_bounds(problem, scale)
+        steady = problem.steady_width(main)
+        inputs = input_bounds(problem, steady if np.isfinite(steady).all() else scale)
         return assemble(plan, problem, box, gains, inputs, everywhere.affine, dials.methods, dials.sweeps)
 
     def finished(observer: Observer) -> Observer:

@@ -8,19 +8,19 @@ linear program to be best at the steady width, row by row.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from gsisio_jax.design.basic_inverses import basic_left_inverses, circuits
+from gsisio_jax.design.gain_selection import units
 from gsisio_jax.design.linear_program import Expression, LinearProgram
 from gsisio_jax.design.problem import GainProblem, without_rounding
 from gsisio_jax.observer.bank import LinearBounds
 from gsisio_jax.observer.types import ExactInputs
 
-_APART = 1e8  # times as large as that of another one may be the effect of an input, before a solver mistakes the other
+_NEAR = 10  # powers of two between units that a solver does not mind
 MOST_SUPPORTS = 500  # basic left inverses per group of inputs that share rows; each costs time in every step
 
 
@@ -48,13 +48,15 @@ def _joint(problem: GainProblem, width: np.ndarray, complete: bool) -> LinearBou
     s = problem.columns - l - q
     direct, lifted = [], []
     if p:
-        unit = _units(problem)
-        inner = replace(problem, G=problem.G * unit, H=problem.H * unit, dd=problem.dd / unit[~problem.free])
-        direct = _distinct([_direct(inner, width, use_y) for use_y in (True, False)])
-        lifted = _distinct([_lifted(inner, width, *use) for use in product((True, False), repeat=2)])
+        inner, (x, y, z, d) = _scaled(problem, width)
+        direct = _distinct([_direct(inner, width / x, use_y) for use_y in (True, False)])
+        lifted = _distinct([_lifted(inner, width / x, *use) for use in product((True, False), repeat=2)])
         if not complete:  # where all basic rows are there, the pseudo-inverse adds nothing to them
             direct = _distinct([*direct, _pseudo_inverse(inner)])
-        direct, lifted = ([unit[:, None] * rows for rows in found] for found in (direct, lifted))
+        of_rows = np.concatenate([x, y]), np.concatenate([y, z, x[problem.bounded_states]])
+        direct, lifted = (
+            [d[:, None] * rows / of for rows in found] for found, of in zip((direct, lifted), of_rows, strict=True)
+        )
     else:
         direct = [np.zeros((0, n + l))]
     rows = []
@@ -88,12 +90,14 @@ def _exact(problem: GainProblem, width: np.ndarray) -> tuple[ExactInputs, str]:
     return exact, "" if exact.complete else "input boxes are not exact: " + (inverses.note or rings.note)
 
 
-def _units(problem: GainProblem) -> np.ndarray:
-    """Powers of two (p,), in which inputs of very different units act alike; else 1."""
-    size = np.abs(np.vstack([problem.G, problem.H])).max(axis=0)
-    if size.max() <= _APART * size.min():
-        return np.ones(len(size))
-    return 2.0 ** -np.round(np.log2(size))
+def _scaled(problem: GainProblem, width: np.ndarray) -> tuple[GainProblem, tuple[np.ndarray, ...]]:
+    """The problem in units of boxes, noise and inputs, where these are far from those of the plant, and the units:
+    solvers take what is small for nothing."""
+    x = np.where(width > 0, width, units(width))
+    found = problem.units(x, powers=True)
+    if all((abs(np.log2(unit)) <= _NEAR).all() for unit in found):
+        return problem, tuple(np.ones_like(unit) for unit in found)
+    return problem.scaled(x, powers=True), found
 
 
 def _direct(problem: GainProblem, width: np.ndarray, use_y: bool) -> np.ndarray | None:

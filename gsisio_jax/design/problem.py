@@ -127,10 +127,16 @@ class GainProblem:
         """``(I - |N_z| R - A)^{-1} b``, infinite where the recursion does not contract."""
         return steady_state(self.growth(N) + self.implicit(N), self.noise_width(N))
 
-    def scaled(self, x: np.ndarray) -> GainProblem:
-        """The same problem in units `x` of the states, (n,), and in units of the noise for the outputs."""
-        y, d = self.output_units, self.input_units(x)
-        z = np.abs(self.T2) @ y
+    def units(self, x: np.ndarray, powers: bool = False) -> tuple[np.ndarray, ...]:
+        """Units of states, outputs, rows of T2 and inputs in `scaled`."""
+        y = self.output_units
+        found = x, y, np.abs(self.T2) @ y, self.input_units(x)
+        return tuple(2.0 ** np.round(np.log2(unit)) for unit in found) if powers else found
+
+    def scaled(self, x: np.ndarray, powers: bool = False) -> GainProblem:
+        """The same problem in units `x` of the states, (n,), and in units of the noise for the outputs; or in the
+        powers of two next to these, so that no number is rounded."""
+        x, y, z, d = self.units(x, powers)
         zs = np.concatenate([z, x[self.bounded_states]])
         return replace(
             self,

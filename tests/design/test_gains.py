@@ -165,3 +165,20 @@ def test_an_input_that_is_known_precisely_is_cancelled():
     state = gx.estimate(observer, gx.Interval([-1.0], [1.0]), d[:, None]).state
     assert state.contains(x).all()
     assert (state.width <= 2e5).all()
+
+
+def test_promised_widths_of_inputs_are_the_same_in_all_units():
+    """A solver takes what is small for nothing: 27 and 1.8 were promised in the place of .78, or the design refused."""
+    rng, promised = np.random.default_rng(0), []
+    A, G, C = (np.round(rng.normal(size=shape), 3) for shape in ((3, 3), (3, 1), (3, 3)))
+    for S, d in ((np.ones(3), 1.0), (np.array([1e5, 1, 1e-3]), 1.0), (np.ones(3), 1e5), (np.full(3, 1e5), 1e-3)):
+        system = gx.System(
+            lambda x, F=0.4 * A * S / S[:, None]: F @ x,
+            lambda x, E=C * S: E @ x,
+            G=G * d / S[:, None],
+            H=np.zeros((3, 1)),
+        )
+        noise = gx.Noise(Interval.symmetric([0.5, 0.05, 0.02] / S), Interval.symmetric([0.1, 0.3, 0.05]))
+        found = gx.design_observer(system, noise, Interval.entire(3), missing=False, sweeps=1, window=1).certificate
+        promised.append(d * found.input_width[0])
+    np.testing.assert_allclose(promised, promised[0], rtol=1e-6)
