@@ -15,6 +15,7 @@ from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.enclosures import slopes_of
 from gsisio_jax.plant.lift import lifted, output_of
+from gsisio_jax.plant.system import System
 
 _AS_WIDE = 0.99  # of the state bounds
 _WORTH = 0.5  # of the width without a delay
@@ -43,8 +44,13 @@ def what_a_delay_gives(plan: Plan, certificate: Certificate, region: Interval) -
     note = f"of state {named} no more is promised than the state bounds"
     if system.periodic or system.periodic_states:  # no delay goes with these
         return note
+    shown = system.l
     for delay in range(1, min(system.n, _LONGEST) + 1):
-        found = _steady(plan, region, delay)
+        longer = lifted(system, delay)
+        before, shown = shown, longer.l
+        if shown == before:  # no later output is free of the unknown input: the plant as it was
+            continue
+        found = _steady(plan, longer, region)
         better = np.flatnonzero(wide & (found <= _WORTH * steady))
         if len(better):
             widths = ", ".join(f"{found[i]:.4g} of state {i + 1}" for i in better)
@@ -54,11 +60,10 @@ def what_a_delay_gives(plan: Plan, certificate: Certificate, region: Interval) -
     return note
 
 
-def _steady(plan: Plan, region: Interval, delay: int) -> np.ndarray:
-    """Steady widths with that delay, infinite where it gives no design."""
+def _steady(plan: Plan, longer: System, region: Interval) -> np.ndarray:
+    """Steady widths of a lifted plant, infinite where it gives no design."""
     endless = np.full(plan.system.n, np.inf)
     try:
-        longer = lifted(plan.system, delay)
         feedthrough = factorise(np.asarray(longer.H))
         slopes = slopes_of(longer, feedthrough.T2, plan.u_region)(region)
         if not slopes.finite:
