@@ -11,7 +11,7 @@ import numpy as np
 
 from .._version import __version__
 from .problem import Names, Problem
-from .report import Notes, certificate_lines, doubt, outside, promised
+from .report import Notes, at_rates, certificate_lines, doubt, outside, promised
 from .run import Outcome
 from .totals import Totals
 
@@ -25,7 +25,8 @@ def run_figures(
         ``title``, ``library``, ``steps``, ``time`` (first and last, seconds), ``missing`` (rows without any and with
         some entries missing), ``statuses`` (steps by bit), ``outside`` (``steps`` without a promised width, because the
         box of this or the last one is outside of the region at ``boxes`` of them, or u of `u_region` at ``inputs``, or
-        measurements of this or the last one are missing or contradicted, at ``measurements``),
+        measurements of this or the last one are missing or contradicted, at ``measurements``; null where outputs come
+        at several `rates`, as entries that are missing for that are no gap),
         ``doubt`` (text where nearly every step contradicts the bounds, else null), ``resumed`` (steps taken from an
         interrupted run), ``delay`` (L: boxes are from measurements up to L steps later), ``seconds``, ``table`` (what
         was found in the file and is not plain), ``signals``, ``alarms`` (as in the NetCDF file, the first 10,000),
@@ -52,7 +53,9 @@ def run_figures(
         "time": {"first": totals.first, "last": totals.last},
         "missing": {"rows": totals.absent, "partly": totals.partly},
         "statuses": totals.statuses,
-        "outside": {
+        "outside": None
+        if at_rates(outcome)
+        else {
             "steps": found.outside,
             "boxes": found.boxes,
             "inputs": found.inputs,
@@ -81,7 +84,8 @@ def certificate_figures(certificate: Any, problem: Problem) -> dict[str, Any]:
     Returns:
         ``certified``, ``self_consistent``, ``region_matters``, ``recoverable`` (null: not examined), ``rate``,
         ``implicit_rate``, ``equality_residual``; ``states`` and ``inputs`` with ``name``, ``unit``, ``steady_width``,
-        states also with ``region_width`` and ``slack``; ``text``, the promise in words, and ``notes``.
+        states also with ``region_width`` and ``slack``, and ``rate_width``, the widest of all rows, where rows over
+        several steps or for ``rates`` promise widths; ``text``, the promise in words, and ``notes``.
     """
 
     def rows(group: Names, **columns: Any) -> list[dict[str, Any]]:
@@ -91,6 +95,7 @@ def certificate_figures(certificate: Any, problem: Problem) -> dict[str, Any]:
         ]
 
     region = np.asarray(certificate.region.width)
+    by_rates = {} if certificate.rates is None else {"rate_width": certificate.settled_widths[0]}
     words = certificate_lines(certificate, problem)
     notes = [str(note) for note in certificate.notes]
     return {
@@ -102,7 +107,11 @@ def certificate_figures(certificate: Any, problem: Problem) -> dict[str, Any]:
         "implicit_rate": float(certificate.implicit_rate),
         "equality_residual": float(certificate.equality_residual),
         "states": rows(
-            problem.state, steady_width=certificate.steady_width, region_width=region, slack=certificate.slack
+            problem.state,
+            steady_width=certificate.steady_width,
+            region_width=region,
+            slack=certificate.slack,
+            **by_rates,
         ),
         "inputs": rows(problem.input, steady_width=certificate.input_width),
         "text": words[: len(words) - len(notes)],

@@ -94,10 +94,16 @@ def outside(totals: Totals, outcome: Outcome) -> Outside:
     return Outside(totals.steps, totals.outside, totals.beyond, outcome.u_outside, totals.unread)
 
 
+def at_rates(outcome: Outcome) -> bool:
+    """The promise is one for outputs of several rates."""
+    rates = outcome.observer.certificate.rates
+    return rates is not None and rates.period > 1
+
+
 def said_outside(totals: Totals, outcome: Outcome) -> str:
     """The line of the summary on steps without a promised width."""
     rates = outcome.observer.certificate.rates
-    if rates is not None and rates.period > 1:
+    if at_rates(outcome):
         return f"not counted: a width is promised while outputs come every {', '.join(map(str, rates.rates))} rows"
     return str(outside(totals, outcome))
 
@@ -152,13 +158,10 @@ def promised(totals: Totals, certificate: Any) -> Iterator[tuple[Signal, float |
     """Every signal with its certified width and its room in the region; None where nothing is promised."""
     # Where f and g are affine there is no region to leave.
     rooms = np.asarray(certificate.slack) if certificate.region_matters else [None] * len(certificate.steady_width)
-    of_states, of_inputs, by_rates = certificate.steady_width, certificate.input_width, certificate.rates is not None
-    if by_rates:  # the widest of all phases; of inputs nothing is promised for rates
-        of_states, of_inputs = certificate.rate_width.max(0), np.full(len(of_inputs), np.inf)
-    states = zip(np.asarray(of_states), rooms, strict=True)
-    inputs = ((width, None) for width in np.asarray(of_inputs))
+    of_states, of_inputs = certificate.settled_widths
+    states, inputs = zip(of_states, rooms, strict=True), ((width, None) for width in of_inputs)
     for signal, (width, room) in zip(totals.signals, (*states, *inputs), strict=True):
-        there = np.isfinite(width) if by_rates else certificate.certified
+        there = certificate.certified if certificate.rates is None else np.isfinite(width)
         yield (signal, float(width), room) if there else (signal, None, None)
 
 

@@ -111,6 +111,14 @@ class Certificate(eqx.Module):
         return self.rates is not None and bool(np.isfinite(self.rate_width).all())
 
     @property
+    def settled_widths(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) and (p,): widths at or below which boxes of states and of inputs settle in every row while outputs come
+        as the design assumed; ``inf`` where none is promised. With `rates` the widest of all phases."""
+        if self.rates is None:
+            return np.asarray(self.steady_width), np.asarray(self.input_width)
+        return np.asarray(self.rate_width).max(0), np.full(np.shape(self.input_width), np.inf)
+
+    @property
     def slack(self) -> np.ndarray:
         """Region width minus steady width, (n,)."""
         if not self.certified:

@@ -184,14 +184,14 @@ def _of_study(dataset: Any) -> Tubes:
 
 
 def _promised(call: str, series: dict[str, Tube], certificate: Any) -> dict[str, Tube]:
-    """The same with the steady widths of a certificate."""
-    if not hasattr(certificate, "steady_width"):
+    """The same with the widths at which boxes settle by a certificate."""
+    if not hasattr(certificate, "settled_widths"):
         raise ValueError(
             f"{call}: `certificate` must be that of an observer (observer.certificate), got "
             f"{type(certificate).__name__}"
         )
     promised = dict(series)
-    for kind, steady in (("state", certificate.steady_width), ("input", certificate.input_width)):
+    for kind, steady in zip(("state", "input"), certificate.settled_widths, strict=True):
         mine = [one for one in series.values() if one.kind == kind]
         if mine and len(mine) != len(steady):
             raise ValueError(

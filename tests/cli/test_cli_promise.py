@@ -11,6 +11,7 @@ from gsisio_jax.cli.boxes import record_type
 from gsisio_jax.cli.problem import Names
 from gsisio_jax.cli.report import certificate_lines, outside, promised, said_outside
 from gsisio_jax.cli.totals import gather
+from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.status import Status
 from gsisio_jax.observer.summary import Outside, summary, units_hint, where
 
@@ -21,7 +22,7 @@ def run(status, lower, upper):
     rows["status"], rows["state_lower"][:, 0], rows["state_upper"][:, 0] = status, lower, upper
     problem = SimpleNamespace(**{group: Names(("x",), ("",)) for group in ("state", "output")}, input=Names((), ()))
     certificate = SimpleNamespace(
-        rates=None,
+        rates=None, input_width=np.zeros(0),
         region=Interval([-1.0], [1.0]), certified=True, self_consistent=True, region_matters=True, recoverable=None,
         notes=(),
     )  # fmt: skip
@@ -53,7 +54,8 @@ def test_what_is_promised_for_rates_is_said_in_the_place_of_the_rest():
     totals, problem, certificate = run([2, 2, 0, 2], [-1] * 4, [0] * 4)
     certificate.rates = SimpleNamespace(period=2, rates=(2,))
     certificate.rate_width, certificate.region_matters = np.array([[0.5], [0.75]]), False
-    certificate.steady_width, certificate.input_width = np.array([2.0]), np.zeros(0)
+    certificate.steady_width = np.array([2.0])
+    certificate.settled_widths = Certificate.settled_widths.fget(certificate)
     (line,) = certificate_lines(certificate, problem, Outside(4, 4, 0, 4))
     assert line.startswith("holds anywhere: while outputs come at the stated rates")
     assert next(iter(promised(totals, certificate)))[1] == 0.75

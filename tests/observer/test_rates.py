@@ -74,6 +74,9 @@ def test_the_promise_follows_the_noise_and_is_printed():
     doubled = gx.Noise(Interval.symmetric(2 * W), Interval.symmetric(2 * V))
     np.testing.assert_allclose(certificate.rates.settled(doubled), 2 * certificate.rate_width, rtol=1e-5)
     assert "outputs every 1, 5 rows" in str(certificate)
+    states, inputs = certificate.settled_widths  # what pictures and reports show
+    np.testing.assert_array_equal(states, certificate.rate_width.max(0))
+    assert np.isinf(inputs).all()
 
 
 def test_states_that_no_output_tells_have_no_promise_and_the_others_keep_theirs():

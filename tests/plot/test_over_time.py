@@ -12,7 +12,7 @@ from plot.studies import TIME, kept
 from gsisio_jax import dataset, plot
 from gsisio_jax.interval import Interval
 
-CERTIFICATE = SimpleNamespace(steady_width=np.array([0.25]), input_width=np.array([0.75]))
+CERTIFICATE = SimpleNamespace(settled_widths=(np.array([0.25]), np.array([0.75])))
 
 
 def line_of(axis, label):
@@ -176,7 +176,7 @@ def test_a_kept_study_has_heat_maps_and_curves_too():
         ),
         (lambda: plot.widths(kept(), certificate=3), "must be that of an observer .* got int"),
         (
-            lambda: plot.widths(estimates(), certificate=SimpleNamespace(steady_width=[1, 2], input_width=[1])),
+            lambda: plot.widths(estimates(), certificate=SimpleNamespace(settled_widths=([1, 2], [1]))),
             "system with 2 states, here are 1: x1",
         ),
         (lambda: plot.widths([1.0]), "widths: expected an estimate, .* got list"),
