@@ -11,7 +11,6 @@ from gsisio_jax.cli.boxes import record_type
 from gsisio_jax.cli.problem import Names
 from gsisio_jax.cli.report import certificate_lines, outside, promised, said_outside
 from gsisio_jax.cli.totals import gather
-from gsisio_jax.observer.certificate import Certificate
 from gsisio_jax.observer.status import Status
 from gsisio_jax.observer.summary import Outside, summary, units_hint, where
 
@@ -55,7 +54,7 @@ def test_what_is_promised_for_rates_is_said_in_the_place_of_the_rest():
     certificate.rates = SimpleNamespace(period=2, rates=(2,))
     certificate.rate_width, certificate.region_matters = np.array([[0.5], [0.75]]), False
     certificate.steady_width = np.array([2.0])
-    certificate.settled_widths = Certificate.settled_widths.fget(certificate)
+    certificate.settled_widths = np.array([0.75]), np.zeros(0)
     (line,) = certificate_lines(certificate, problem, Outside(4, 4, 0, 4))
     assert line.startswith("holds anywhere: while outputs come at the stated rates")
     assert next(iter(promised(totals, certificate)))[1] == 0.75
