@@ -110,9 +110,8 @@ def said_outside(totals: Totals, outcome: Outcome) -> str:
 
 def certificate_lines(certificate: Any, problem: Problem, found: Outside | None = None) -> list[str]:
     """The certificate in short: what is promised, or why nothing is, and where a run was outside of it."""
-    if certificate.rates is not None and np.isfinite(certificate.rate_width).all():
-        many = len(certificate.rate_width) > 1
-        when = "outputs come at the stated rates" if many else "no measurement is missing"
+    if certificate.settles_by_rates:
+        when = "outputs come at the stated rates" if certificate.rates.period > 1 else "no measurement is missing"
         lines = [f"holds anywhere: while {when}, widths settle at or below the certified ones"]
     elif not certificate.certified:
         lines = ["none: no bound on the widths is promised (the boxes are guaranteed all the same)"]

@@ -142,9 +142,7 @@ def _stepped(
     matrix = _input_matrix(field, given)
     if not bound:
         return found, matrix, None, ()
-    terms = StepError(
-        field, given.h, given.order, method == "rk4", matrix, given.u, given.d, given.spread, given.eps, given.never
-    )  # fmt: skip
+    terms = _error_of(field, given, method, matrix)
     parts = list(cells_of(given.region, cells))
     try:
         error = sides.hull([terms.on(cell) for cell in parts])
@@ -156,6 +154,12 @@ def _stepped(
             f"{given.region[0]} to {given.region[1]}; or give bound=False"
         ) from None
     return found, matrix, error, terms.notes(error, given.region, len(parts) > 1)
+
+
+def _error_of(field: Field, given: Arguments, method: str, matrix: np.ndarray) -> StepError:
+    return StepError(
+        field, given.h, given.order, method == "rk4", matrix, given.u, given.d, given.spread, given.eps, given.never
+    )  # fmt: skip
 
 
 def _held(
@@ -171,10 +175,7 @@ def _held(
                 'discretize: method="zoh" needs an f that is affine everywhere where an unknown input has no bound, as '
                 "it can take the state anywhere within a step; f is affine on the region alone. Give `input_bounds`"
             )
-        terms = StepError(
-            field, given.h, 1, False, given.h * field.G, given.u, given.d, given.spread, given.eps, given.never
-        )
-        return terms.around.of(given.region)
+        return _error_of(field, given, "zoh", given.h * field.G).around.of(given.region)
 
     of_field = affine(field, given.region, given.u, reach if bound else None)
     A, c = of_field.A, of_field.c

@@ -52,9 +52,9 @@ class Around:
     def of(self, x: Sides) -> Sides:
         """A box that holds every solution over a step that starts in x."""
         # A tenth of a wide region may be far beyond what a short step can reach: where f has no bound, perhaps.
-        for more, rate_on in ((_by_width, self.field), (_by_way, self.field)):
+        for more in (_by_width, _by_way):
             with contextlib.suppress(ValueError):
-                return self._enclosure(x, more, rate_on)
+                return self._enclosure(x, more, self.field)
         return self._enclosure(x, _by_way, self.rate)
 
     def _enclosure(self, x: Sides, more: Callable[[Sides, Sides], Sides], rate_on: Callable[[Sides], Sides]) -> Sides:
@@ -92,9 +92,9 @@ class Around:
 
     def _tighter(self, around: Sides, moved: Callable[[Sides], Sides]) -> Sides:
         """A smaller box that passes the same test, with F bounded part by part, where that is worth it."""
+        if not self._in_parts(around):
+            return around
         for _ in range(_TIGHTER_IN_PARTS):
-            if not self._in_parts(around):
-                break
             image = moved(around)
             if not (sides.inside(image, around) and sides.inside(moved(image), image)):
                 break

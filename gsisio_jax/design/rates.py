@@ -16,12 +16,13 @@ from gsisio_jax.design.gain_selection import profile_of, units
 from gsisio_jax.design.gains import profile_gain
 from gsisio_jax.design.problem import GainProblem
 from gsisio_jax.design.window import as_window
-from gsisio_jax.design.window_program import masked_program
+from gsisio_jax.design.window_program import best_rows, masked_program
 from gsisio_jax.design.window_runs import FAR, Rows, sizes_of_parts
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.interval.reading import is_whole
 from gsisio_jax.observer.rate_widths import RateWidths
 from gsisio_jax.observer.window import Window
+from gsisio_jax.observer.window_widths import WindowWidths, slopes_by_lag
 
 _LONGEST = 200  # rows of a pattern: the least common multiple of its rates
 _STEPS = (5, 10, 20, 40)  # about so many steps "auto" tries, whole periods
@@ -142,8 +143,7 @@ class _Found:
                 # Between phases in which slow outputs come, rows are asked for in the end only, and kept if they tell.
                 if phase in phases or (visit == last and phase in middle):
                     size = sizes_of_parts(problem, history)
-                    best = [programs[phase].best(state, size, np.zeros_like(size)) for state in range(n)]
-                    reached = np.array([np.inf if row is None else row[1] for row in best])
+                    best, reached = best_rows(programs[phase], n, size)
                     now = np.minimum(by_gains, reached)
                     least = _WORTH if phase in phases else _NARROWER
                     if visit == last:
@@ -200,14 +200,12 @@ def rate_widths(
         if np.count_nonzero(problem.C[j]) == 1:
             i = int(np.flatnonzero(problem.C[j])[0])
             add([], np.zeros(n), problem.T2[j] / problem.C[j, i], 0.0, [support[j]], i)
-    for r, i in enumerate(window.targets if window is not None else ()):
-        assert window is not None
-        of_f, of_g = window.multipliers[:, r, :n], window.multipliers[:, r, n:]
-        lags = [of_f[t] @ problem.F + of_g[t] @ problem.E - window.states(t, n)[r] for t in range(N)]
-        v = np.abs(of_g).sum(0) + np.abs(window.remainder[r] @ problem.T2)
-        more = float(np.abs(window.known[:, r]).sum(0) @ problem.dd)
-        needs = [support[window.remainder[r] != 0].any(0), *(of_g != 0)]
-        add(lags, np.abs(of_f).sum(0), v, more, needs, i)
+    if window is not None:
+        widths = WindowWidths.of(window, problem.F, problem.E, problem.T2, problem.dd)
+        lags = slopes_by_lag(window, problem.F, problem.E)
+        for r, i in enumerate(window.targets):
+            needs = [support[window.remainder[r] != 0].any(0), *(window.multipliers[:, r, n:] != 0)]
+            add(list(lags[:, r]), widths.noise_w[r], widths.noise_v[r], float(widths.fixed[r]), needs, i)
     return RateWidths(
         slopes=np.array(slopes).transpose(1, 0, 2), noise_w=np.array(of_w), noise_v=np.array(of_v),
         fixed=np.array(fixed), holds=np.array(holds).T, targets=tuple(targets), rates=rates,

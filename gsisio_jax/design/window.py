@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
-from gsisio_jax.design.window_length import length_worth_trying, widths_from_above
+from gsisio_jax.design.window_length import length_worth_trying, share_left
 from gsisio_jax.design.window_runs import Rows
 from gsisio_jax.design.window_search import WORTH, Search
 from gsisio_jax.interval.box import Interval
@@ -85,10 +85,9 @@ def what_windows_may_give(observer: Observer, problem: GainProblem, width: np.nd
     if observer.window is not None:
         if observer.window.length <= longest // 2:
             return ""
-        scaled = problem.scaled(width)
-        if length_worth_trying(scaled, (longest, 2 * longest)) == longest:
+        share = share_left(problem.scaled(width), longest, 2 * longest)
+        if share is None:
             return ""
-        share = (widths_from_above(scaled, 2 * longest) / widths_from_above(scaled, longest)).min()
         return (
             f'window="auto" ends at {longest} steps; the best rows over {2 * longest} make boxes of some state '
             f"{1 / share:.2g} times narrower in the end: `window={2 * longest}`, where a step may take as much longer"

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
-from gsisio_jax.design.window_program import WindowProgram
+from gsisio_jax.design.window_program import WindowProgram, best_rows
 from gsisio_jax.design.window_runs import FAR, sizes_of_parts
 
 _ROUNDS = 5  # from boxes of which nothing is known; each is a bound by itself
@@ -29,8 +29,7 @@ def widths_from_above(problem: GainProblem, steps: int) -> np.ndarray:
     half[problem.bounded_states] = np.minimum(FAR, problem.ds / 2)
     for _ in range(_ROUNDS):
         size = sizes_of_parts(problem, [half] * steps)
-        found = [program.best(state, size, np.zeros_like(size)) for state in range(problem.n)]
-        before, half = half, np.minimum(half, [np.inf if row is None else row[1] for row in found])
+        before, half = half, np.minimum(half, best_rows(program, problem.n, size)[1])
         if (half >= (1 - _SETTLED) * before).all():
             break
     return np.maximum(half, 1e-12)
@@ -62,6 +61,15 @@ def length_worth_trying(problem: GainProblem, lengths: tuple[int, ...]) -> int:
             return shorter
         before = now
     return lengths[-1]
+
+
+def share_left(problem: GainProblem, shorter: int, longer: int) -> float | None:
+    """The least share of a width that the best rows over the longer window leave of the shorter one's; None where that
+    window is not worth trying (`length_worth_trying`)."""
+    if problem.n * longer > _LARGEST:
+        return None
+    share = float((widths_from_above(problem, longer) / widths_from_above(problem, shorter)).min())
+    return share if share < 1 - _NARROWER else None
 
 
 def _moving_what_is_seen(problem: GainProblem, width: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -95,6 +96,13 @@ class WindowProgram:
             if np.abs(self.equal @ x + self.equal_offset[:, state]).max() > _SMALL:
                 return None
         return x
+
+
+def best_rows(program: WindowProgram, n: int, size: np.ndarray) -> tuple[list[Any], np.ndarray]:
+    """The best row of each of n states for boxes around the truth, None where there is none, and half the widths (n,)
+    that they lead to, infinite there."""
+    best = [program.best(state, size, np.zeros_like(size)) for state in range(n)]
+    return best, np.array([np.inf if row is None else row[1] for row in best])
 
 
 def masked_program(problem: GainProblem, steps: int, present: np.ndarray, phase: int) -> WindowProgram:

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from gsisio_jax.design.problem import GainProblem
-from gsisio_jax.design.window_program import WindowProgram, rows_of_gains
+from gsisio_jax.design.window_program import WindowProgram, best_rows, rows_of_gains
 from gsisio_jax.design.window_runs import FAR, RUNS, Measured, Rows, Runs, mean_log_width, sizes_of_parts
 
 WORTH = 0.05  # share of the width of some state that a window must bring to be worth its operations
@@ -229,8 +229,7 @@ def _add_profile_rows(problem: GainProblem, steps: int, length: int, rows: Rows)
         best = []
         for _ in range(30 if count == 1 else 3):
             size = sizes_of_parts(problem, [half] * length)
-            best = [program.best(state, size, np.zeros_like(size)) for state in range(problem.n)]
-            reached = np.array([np.inf if row is None else row[1] for row in best])
+            best, reached = best_rows(program, problem.n, size)
             reached = np.minimum(reached, FAR)
             settled = np.allclose(reached, half, rtol=1e-3)
             half = np.maximum(reached, 1e-12)

@@ -31,16 +31,7 @@ def _classes() -> dict[str, type]:
     from gsisio_jax.inclusion.atoms import AtomBounds
     from gsisio_jax.inclusion.planes import Abstraction
     from gsisio_jax.interval.box import Interval
-    from gsisio_jax.observer import (
-        bank,
-        input_memory,
-        past,
-        recovery,
-        slices,
-        types,
-        window,
-        window_widths,
-    )
+    from gsisio_jax.observer import bank, input_memory, past, recovery, slices, types, window, window_widths
     from gsisio_jax.observer.certificate import Certificate
     from gsisio_jax.observer.delayed import DelayedObserver, Waiting
     from gsisio_jax.observer.prediction_step import PredictionObserver

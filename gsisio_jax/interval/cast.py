@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gsisio_jax._calls import config
+
 
 def as_array(value: Any, dtype: Any = None) -> Any:
     """`jnp.asarray`, which compiles a program for every shape of a NumPy array; here numbers that are known are copied
@@ -47,7 +49,7 @@ def looked_at(value: Any) -> np.ndarray:
 
 def default_device() -> Any:
     """Where JAX puts what says nothing of it, if a user has chosen that; else None."""
-    return getattr(jax.config, "jax_default_device")  # noqa: B009 (pyright knows no such name)
+    return config.jax_default_device
 
 
 def cast_towards(value: Any, dtype: Any, towards: float) -> Any:

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 from jax.core import Tracer
 
+from gsisio_jax._calls import config
 from gsisio_jax.interval.box import Interval
 from gsisio_jax.observer.fixed import Fixed, jitted
 from gsisio_jax.observer.types import Carry
@@ -61,8 +62,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
                     raise
         # A missing measurement is NaN, also in what a gradient outside of `jax.jit` keeps of the run: `jax_debug_nans`
         # would take that for an error. Computed again it stays inside of a program.
-        debugged = getattr(jax.config, "jax_debug_nans")  # noqa: B009 (pyright knows no such name)
-        return jitted(kept_inside if debugged else function, static, traced, ("hold",))(*args)
+        return jitted(kept_inside if config.jax_debug_nans else function, static, traced, ("hold",))(*args)
 
     return run
 

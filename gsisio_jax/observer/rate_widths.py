@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from gsisio_jax.observer.window_widths import added_by
 from gsisio_jax.plant.system import Noise
 
 _FAR = 1e6  # times what noise adds: the boxes that the recursion begins with
@@ -55,7 +56,7 @@ class RateWidths(eqx.Module):
         until it is 1; and U_{k+m} <= U_k for their end m, so later widths are at most the largest of any m
         successive U of their phase. Every round of the recursion over all phases keeps that.
         """
-        added = noise.w.width @ self.noise_w.T + noise.v.width @ self.noise_v.T + self.fixed
+        added = added_by(self, noise)
         n, targets = self.slopes.shape[2], np.array(self.targets)
         least = [added[targets == i].min(initial=np.inf) for i in range(n)]
         largest = max([size for size in least if np.isfinite(size)], default=1.0) or 1.0

@@ -18,6 +18,18 @@ _MOST = 10_000  # rounds, each of which is a promise by itself
 _SETTLED = 1e-9  # relative change of a round that ends them
 
 
+def slopes_by_lag(window: Window, F: np.ndarray, E: np.ndarray) -> np.ndarray:
+    """What rows make of the box of x[k-1-t] for every lag t, (N, R, n), with the slopes of f and g."""
+    n = len(F)
+    of_f, of_g = window.multipliers[:, :, :n], window.multipliers[:, :, n:]
+    return np.array([of_f[t] @ F + of_g[t] @ E - window.states(t, n) for t in range(window.length)])
+
+
+def added_by(rows: Any, noise: Noise) -> np.ndarray:
+    """What noise, and all that is `fixed`, add to the widths by these rows, (..., R)."""
+    return np.asarray(noise.w.width @ rows.noise_w.T + noise.v.width @ rows.noise_v.T + rows.fixed)
+
+
 class WindowWidths(eqx.Module):
     """What R rows make of widths.
 
@@ -39,9 +51,8 @@ class WindowWidths(eqx.Module):
         """From the rows, the slopes of f and g, T2, and the widths (b,) of inputs with known bounds."""
         n = len(F)
         of_f, of_g = window.multipliers[:, :, :n], window.multipliers[:, :, n:]
-        slopes = [of_f[t] @ F + of_g[t] @ E - window.states(t, n) for t in range(window.length)]
         return cls(
-            slopes=np.abs(slopes).sum(0),
+            slopes=np.abs(slopes_by_lag(window, F, E)).sum(0),
             noise_w=np.abs(of_f).sum(0),
             noise_v=np.abs(of_g).sum(0) + np.abs(window.remainder @ T2),
             fixed=np.abs(window.known).sum(0) @ inputs,
@@ -50,7 +61,7 @@ class WindowWidths(eqx.Module):
 
     def settled(self, width: Any, noise: Noise) -> np.ndarray:
         """Widths (..., n) at or below which boxes settle, if they settle at or below `width`."""
-        added = noise.w.width @ self.noise_w.T + noise.v.width @ self.noise_v.T + self.fixed
+        added = added_by(self, noise)
         found, targets = np.asarray(width, np.float64), np.array(self.targets)
         for _ in range(_MOST):
             rows = found @ self.slopes.T + added

@@ -150,12 +150,17 @@ def moved(system: System, x: Any, d: Any, u: Any, w: Any, bounds: Interval) -> t
     return _add(system.dynamics(x, u) + system.B @ u + system.G @ d, w, bounds)
 
 
+def pulled_in(noise: Any, box: Interval, margin: Any) -> Any:
+    """Noise that keeps off the sides of its box by `margin`, or is in the middle where there is no room for that."""
+    low, high = jnp.minimum(box.lower + margin, box.center), jnp.maximum(box.upper - margin, box.center)
+    return jnp.clip(noise, low, high)
+
+
 def _add(base: Any, noise: Any, box: Interval) -> tuple[Any, Any]:
     # The sum rounds; the noise the record holds is the difference. Pull it inside by a few ulps where it left.
     total = base + noise
     margin = 4 * jnp.finfo(total.dtype).eps * jnp.abs(total)
-    low, high = jnp.minimum(box.lower + margin, box.center), jnp.maximum(box.upper - margin, box.center)
-    inner = jnp.clip(noise, low, high)
+    inner = pulled_in(noise, box, margin)
     # What was drawn outside of its bounds stays there: an output that may be wrong, or a run that breaks them.
     total = jnp.where(box.contains(total - base) | ~box.contains(noise), total, base + inner)
     return total, total - base

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from gsisio_jax import inclusion
 from gsisio_jax.interval.box import Interval
-from gsisio_jax.plant.simulation import measured, moved
+from gsisio_jax.plant.simulation import measured, moved, pulled_in
 from gsisio_jax.plant.system import System
 
 
@@ -59,9 +59,7 @@ def _inside(base: Any, enclosed: tuple[Any, Any], noise: Any, box: Interval) -> 
 
     total = base + noise
     margin = (high - low) + 8 * eps * (jnp.abs(total) + largest)
-    inner = jnp.clip(
-        noise, jnp.minimum(box.lower + margin, box.center), jnp.maximum(box.upper - margin, box.center)
-    )  # fmt: skip
+    inner = pulled_in(noise, box, margin)
     legal = box.contains(noise)
     total = jnp.where(certain(total) | ~legal, total, base + inner)
     return total, (certain(total) | ~legal).all()

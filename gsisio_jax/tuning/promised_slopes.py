@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsisio_jax.observer.certificate import Certificate
+from gsisio_jax.observer.window_widths import added_by
 from gsisio_jax.plant.system import Noise
 
 _AT = 1e-7  # relative distance within which a width is where a bound of it ends: iterations end at 1e-9
@@ -27,7 +28,7 @@ def width_slopes(certificate: Certificate, noise: Noise) -> tuple[np.ndarray, np
     if certificate.window is not None:
         window = certificate.window
         gain, targets = _of_gain_alone(certificate, noise), np.array(window.targets)
-        reached = widths @ window.slopes.T + _added(certificate, noise)
+        reached = widths @ window.slopes.T + added_by(window, noise)
         narrower = widths < gain * (1 - _AT)
         for i in np.flatnonzero(narrower):
             mine = np.flatnonzero(targets == i)
@@ -44,11 +45,6 @@ def _of_gain_alone(certificate: Certificate, noise: Noise) -> np.ndarray:
     return certificate.response @ np.asarray(certificate.noise_width(noise)) + certificate.response @ np.linalg.solve(
         V, np.broadcast_to(certificate.excess, len(V))
     )
-
-
-def _added(certificate: Certificate, noise: Noise) -> np.ndarray:
-    window = certificate.window
-    return np.asarray(noise.w.width @ window.noise_w.T + noise.v.width @ window.noise_v.T + window.fixed)
 
 
 def _sliced(

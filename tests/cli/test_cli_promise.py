@@ -21,7 +21,7 @@ def run(status, lower, upper):
     rows["status"], rows["state_lower"][:, 0], rows["state_upper"][:, 0] = status, lower, upper
     problem = SimpleNamespace(**{group: Names(("x",), ("",)) for group in ("state", "output")}, input=Names((), ()))
     certificate = SimpleNamespace(
-        rates=None, input_width=np.zeros(0),
+        rates=None, settles_by_rates=False,
         region=Interval([-1.0], [1.0]), certified=True, self_consistent=True, region_matters=True, recoverable=None,
         notes=(),
     )  # fmt: skip
@@ -52,7 +52,7 @@ def test_what_is_promised_for_rates_is_said_in_the_place_of_the_rest():
     """Steps without the slow output are not counted as those without a promise; of inputs nothing is promised."""
     totals, problem, certificate = run([2, 2, 0, 2], [-1] * 4, [0] * 4)
     certificate.rates = SimpleNamespace(period=2, rates=(2,))
-    certificate.rate_width, certificate.region_matters = np.array([[0.5], [0.75]]), False
+    certificate.settles_by_rates, certificate.region_matters = True, False
     certificate.steady_width = np.array([2.0])
     certificate.settled_widths = np.array([0.75]), np.zeros(0)
     (line,) = certificate_lines(certificate, problem, Outside(4, 4, 0, 4))
